@@ -1,0 +1,7 @@
+"""Host-side baselines in numpy and Embree; they share no code with the OpenCL side."""
+
+from .brute_force import BruteForceTracer
+from .embree import EmbreeTracer
+from .reference import render_reference
+
+__all__ = ["BruteForceTracer", "EmbreeTracer", "render_reference"]

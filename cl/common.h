@@ -1,0 +1,29 @@
+// Shared by every file of cl/: rounding rules, constants, small vector helpers.
+//
+// Contraction is off, so that a*b+c rounds twice here as in numpy; where one rounding is wanted,
+// fma() says so. The built-in min, max, fabs, clamp are not used in hot code: PoCL calls them out of
+// line (ten times slower than ?:).
+
+#pragma OPENCL FP_CONTRACT OFF
+
+#define INVALID 0xffffffffu
+
+// One rounding, inline. PoCL compiles the built-in fma() to a call of its library.
+#if defined(POCL_DEVICE_ADDRESS_BITS) && defined(__FMA__) && defined(__AVX512F__)
+#define FMA(a, b, c) __builtin_fmaf(a, b, c)
+#define FMA16(a, b, c) __builtin_ia32_vfmaddps512_mask(a, b, c, (short)-1, 4)
+#else
+#define FMA(a, b, c) fma(a, b, c)
+#define FMA16(a, b, c) fma(a, b, c)
+#endif
+
+#define MIN(a, b) ((a) < (b) ? (a) : (b))
+#define MAX(a, b) ((a) > (b) ? (a) : (b))
+
+// dot and cross of float4 whose w is not meant.
+inline float dot3(float4 a, float4 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+inline float4 cross3(float4 a, float4 b)
+{
+    return (float4)(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x, 0.0f);
+}

@@ -1,0 +1,63 @@
+// Triangles and their bounding spheres, gathered from the mesh once per frame.
+//
+// Output layout:
+//   triangles  three float4 a triangle: v0, v1, v2, w unused
+//   spheres    per block of 16 triangles four float16 rows: centre x, y, z, radius
+// Both are padded to whole blocks; padding has radius -inf, which no test of cl/node.h keeps.
+//
+// Spheres are minimal (design, section 5): the circumcircle's, or that of the longest edge where the
+// triangle is obtuse. The centre is rounded, so the radius is measured from the rounded centre to the
+// three vertices and enlarged by RADIUS_SLACK, eight times the rounding of that distance.
+
+#include "triangle.h"
+
+#define RADIUS_SLACK (1.0f + 0x1p-20f)
+
+inline float4 bounding_sphere(float4 a, float4 b, float4 c)
+{
+    const float4 ab = b - a, ac = c - a, bc = c - b;
+    const float ab2 = dot3(ab, ab), ac2 = dot3(ac, ac), bc2 = dot3(bc, bc);
+    float4 centre;
+    if (ab2 >= ac2 + bc2) {
+        centre = a + 0.5f * ab;
+    } else if (ac2 >= ab2 + bc2) {
+        centre = a + 0.5f * ac;
+    } else if (bc2 >= ab2 + ac2) {
+        centre = b + 0.5f * bc;
+    } else {
+        // Acute, so the denominator is well away from zero.
+        const float4 n = cross3(ab, ac);
+        centre = a + (ac2 * cross3(n, ab) + ab2 * cross3(ac, n)) / (2.0f * dot3(n, n));
+    }
+    const float4 da = a - centre, db = b - centre, dc = c - centre;
+    const float2 far = (float2)(MAX(dot3(da, da), dot3(db, db)), dot3(dc, dc));
+    centre.w = sqrt(MAX(far.x, far.y)) * RADIUS_SLACK;
+    return centre;
+}
+
+// One work-item gathers one block of 16 triangles.
+kernel void gather_triangles(const uint num_triangles, global const float *restrict vertices,
+                             global const uint *restrict faces, global float4 *restrict triangles,
+                             global float *restrict spheres)
+{
+    const uint block = get_global_id(0);
+    for (uint lane = 0; lane < 16; lane++) {
+        const uint i = block * 16 + lane;
+        float4 v[3] = {0.0f, 0.0f, 0.0f};
+        float4 sphere = (float4)(0.0f, 0.0f, 0.0f, -INFINITY);
+        if (i < num_triangles) {
+            for (uint corner = 0; corner < 3; corner++) {
+                global const float *p = vertices + 3 * (ulong)faces[3 * i + corner];
+                v[corner] = (float4)(p[0], p[1], p[2], 0.0f);
+            }
+            sphere = bounding_sphere(v[0], v[1], v[2]);
+        }
+        for (uint corner = 0; corner < 3; corner++)
+            triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = v[corner];
+        global float *rows = spheres + 64 * (ulong)block + lane;
+        rows[0] = sphere.x;
+        rows[16] = sphere.y;
+        rows[32] = sphere.z;
+        rows[48] = sphere.w;
+    }
+}

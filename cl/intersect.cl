@@ -1,0 +1,106 @@
+// Final ray-triangle intersection, and what all tracers share: resolving hits.
+//
+// The closest hit of a ray is the 64-bit minimum over (bits of t, triangle): t >= 0, so its bits sort
+// like its value, and equal distances go to the smaller triangle, whatever the order of work.
+//
+// Build-time constants: CHUNKS.
+
+#pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
+#pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
+
+#include "stream.h"
+#include "triangle.h"
+
+#define MISS 0xffffffffffffffffUL
+
+inline ulong hit_key(float t, uint triangle) { return ((ulong)as_uint(t) << 32) | triangle; }
+
+inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
+{
+    return slot < num_slots ? slots[slot] : INVALID;
+}
+
+// Pairs (node, triangle) whose nodes hold `rays_per_node` consecutive slots. Sets the minimum in
+// `closest` or, where that is what is asked, the flag in `blocked`; counts tests and hits per chunk.
+#define DEFINE_INTERSECT_PAIRS(NAME, RESULT, ON_HIT)                                               \
+    kernel void NAME(global const uint *restrict length, global const Pair *restrict pairs,        \
+                     const uint rays_per_node, const uint num_slots,                               \
+                     global const uint *restrict slots, global const float4 *restrict org_tnear,   \
+                     global const float4 *restrict dir_tfar,                                       \
+                     global const float4 *restrict triangles, global RESULT *restrict result,      \
+                     global uint *restrict chunk_tests, global uint *restrict chunk_hits)          \
+    {                                                                                              \
+        const uint n = *length;                                                                    \
+        uint tests = 0, hits = 0;                                                                  \
+        for (uint i = chunk_begin(n), end = chunk_end(n); i < end; i++) {                          \
+            const Pair pair = pairs[i];                                                            \
+            for (uint k = 0; k < rays_per_node; k++) {                                             \
+                const uint ray = ray_of(pair.x * rays_per_node + k, num_slots, slots);             \
+                if (ray == INVALID || dir_tfar[ray].w < org_tnear[ray].w)                          \
+                    continue;                                                                      \
+                const RayFrame frame = ray_frame(org_tnear[ray], dir_tfar[ray]);                   \
+                const TriangleHit h                                                                \
+                    = intersect_triangle(&frame, triangles + TRIANGLE_FLOAT4S * (ulong)pair.y);    \
+                tests++;                                                                           \
+                if (h.hit) {                                                                       \
+                    hits++;                                                                        \
+                    ON_HIT;                                                                        \
+                }                                                                                  \
+            }                                                                                      \
+        }                                                                                          \
+        chunk_tests[get_global_id(0)] = tests;                                                     \
+        chunk_hits[get_global_id(0)] = hits;                                                       \
+    }
+
+DEFINE_INTERSECT_PAIRS(intersect_pairs, ulong, atom_min(result + ray, hit_key(h.t, pair.y)))
+DEFINE_INTERSECT_PAIRS(occlude_pairs, uchar, result[ray] = 1)
+
+// One work-item: row `row` of counts grows by the chunks' counts of the final tests.
+kernel void sum_final(global const uint *restrict length, global const uint *restrict chunk_tests,
+                      global const uint *restrict chunk_hits, global ulong *restrict counts,
+                      const uint row)
+{
+    global ulong *level = counts + row * LEVEL_COUNTS;
+    for (uint c = 0; c < CHUNKS; c++) {
+        level[LEVEL_TESTS] += chunk_tests[c];
+        level[LEVEL_HITS] += chunk_hits[c];
+    }
+    level[LEVEL_STREAM] = *length;
+}
+
+// Hits from keys: t, triangle, u, v; inf, INVALID, 0, 0 where missed.
+kernel void resolve_hits(const uint num_rays, global const ulong *restrict closest,
+                         global const float4 *restrict org_tnear,
+                         global const float4 *restrict dir_tfar,
+                         global const float4 *restrict triangles, global float *restrict t,
+                         global uint *restrict triangle, global float *restrict u,
+                         global float *restrict v)
+{
+    const uint i = get_global_id(0);
+    if (i >= num_rays)
+        return;
+    TriangleHit h = {INFINITY, 0.0f, 0.0f, 0};
+    uint id = INVALID;
+    if (closest[i] != MISS) {
+        id = (uint)closest[i];
+        const RayFrame frame = ray_frame(org_tnear[i], dir_tfar[i]);
+        h = intersect_triangle(&frame, triangles + TRIANGLE_FLOAT4S * (ulong)id);
+    }
+    t[i] = h.t;
+    triangle[i] = id;
+    u[i] = h.u;
+    v[i] = h.v;
+}
+
+// Flat triangle numbers into (geometry, face within it); -1 where missed.
+kernel void split_ids(const uint num_rays, global const uint *restrict triangle,
+                      global const uint *restrict geom_ids, global const uint *restrict first_prims,
+                      global int *restrict geom_id, global int *restrict prim_id)
+{
+    const uint i = get_global_id(0);
+    if (i >= num_rays)
+        return;
+    const uint id = triangle[i];
+    geom_id[i] = id == INVALID ? -1 : (int)geom_ids[id];
+    prim_id[i] = id == INVALID ? -1 : (int)(id - first_prims[geom_ids[id]]);
+}

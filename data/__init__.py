@@ -1,0 +1,1 @@
+"""What the papers print, as tables; see README.md."""

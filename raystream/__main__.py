@@ -1,0 +1,290 @@
+"""Command line: ``raystream render | compare | devices``."""
+
+import argparse
+import pathlib
+import sys
+
+from tqdm import tqdm
+
+from raystream import image as images
+from raystream import scenes
+from raystream._version import __version__
+from raystream.camera import Camera
+from raystream.device import default_device, devices
+from raystream.errors import BuildError, DeviceError, MemoryLimitError
+from raystream.light import PointLight
+from raystream.renderer import Renderer
+from raystream.scene import load_scene
+from raystream.tracer import methods
+
+# Procedural scenes by name; "name:argument" passes a number or a variant.
+PROCEDURAL = {
+    "demo": scenes.demo,
+    "cornell": scenes.cornell,
+    "bumpy_mirror": scenes.bumpy_mirror,
+    "rings": scenes.rings,
+    "gears": scenes.gears,
+    "balls": scenes.balls,
+    "mountain": scenes.mountain,
+}
+_VECTOR_OPTIONS = ("--eye", "--target", "--up", "--light", "--mirror-ball")
+_BAD_INPUT = 2
+_EXPECTED = (ValueError, TypeError, OSError, DeviceError, BuildError, MemoryLimitError)
+
+_SCENE_HELP = (
+    "a file that trimesh reads (OBJ, PLY, STL, OFF, GLB, ...) or a procedural scene: "
+    + ", ".join(PROCEDURAL)
+    + "; rings:3 passes an argument"
+)
+_RENDER_EXAMPLES = """examples:
+  raystream render demo -o demo.png
+  raystream render kitchen.glb -o kitchen.png --size 1024x768 --mirror 'floor*' --samples 4
+  raystream render bunny.ply -o bunny.exr --eye 0,0.11,0.35 --target -0.017,0.11,0 --light 1,2,1
+  raystream render sponza.obj -o atrium.png --eye -12,4,0 --target 0,3,1 --mirror-ball 0,2,0,1.5
+"""
+_COMPARE_EXAMPLES = """examples:
+  raystream compare demo --methods rsh,embree -o demo
+  raystream compare bunny.ply --methods rsh,brute,embree --mirror '*'
+"""
+
+
+def main(arguments=None):
+    """Run the command line; returns the exit code: 0, 1 a failed check, 2 bad input."""
+    options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    try:
+        return options.run(options)
+    except _EXPECTED as error:
+        print(f"raystream: {error}", file=sys.stderr)
+        return _BAD_INPUT
+
+
+def _joined(arguments):
+    """``--eye -1,2,3`` as ``--eye=-1,2,3``: argparse takes a leading minus for an option."""
+    joined = []
+    for argument in arguments:
+        if joined and joined[-1] in _VECTOR_OPTIONS:
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _parser():
+    parser = argparse.ArgumentParser(
+        prog="raystream", description="Ray queries and Whitted rendering in OpenCL."
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_render(commands)
+    _add_compare(commands)
+    listing = commands.add_parser("devices", help="list the OpenCL devices")
+    listing.set_defaults(run=_devices)
+    return parser
+
+
+def _add_render(commands):
+    command = commands.add_parser(
+        "render",
+        help="render a scene into a picture",
+        epilog=_RENDER_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_scene(command)
+    command.add_argument("-o", "--output", required=True, help="picture: .png .jpg .exr .npy")
+    command.add_argument("--method", default="rsh", help=f"one of {', '.join(methods())}")
+    command.add_argument("--samples", type=int, default=1, help="samples per pixel")
+    command.add_argument(
+        "--verify",
+        action="store_true",
+        help="check every ray against Embree and the picture against the reference renderer",
+    )
+    command.set_defaults(run=_render)
+
+
+def _add_compare(commands):
+    command = commands.add_parser(
+        "compare",
+        help="time methods, and check them against Embree",
+        epilog=_COMPARE_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_scene(command)
+    command.add_argument(
+        "--methods",
+        default="rsh,brute,embree",
+        help=f"of {', '.join(methods())} and embree, with commas between (default: %(default)s)",
+    )
+    command.add_argument("-o", "--output", help="folder for the pictures")
+    command.set_defaults(run=_compare)
+
+
+def _add_scene(command):
+    command.add_argument("scene", help=_SCENE_HELP)
+    add = command.add_argument
+    add("--size", type=_size, default=(512, 512), metavar="WIDTHxHEIGHT")
+    add("--bounces", type=int, default=2, help="generations of reflected and refracted rays")
+    add("--eye", type=_vector, metavar="X,Y,Z", help="camera position (default: the scene's)")
+    add("--target", type=_vector, metavar="X,Y,Z", help="point that the camera looks at")
+    add("--up", type=_vector, default=None, metavar="X,Y,Z",
+        help="up axis; without --eye and --target the camera is fitted to the scene")
+    add("--fov", type=float, default=None, help="vertical field of view in degrees")
+    add("--light", type=_vector, action="append", metavar="X,Y,Z",
+        help="a white point light in place of the scene's; may be repeated")
+    add("--mirror", action="append", default=[], metavar="PATTERN",
+        help="make meshes or materials of that name mirrors; may be repeated")
+    add("--glass", action="append", default=[], metavar="PATTERN",
+        help="make meshes or materials of that name glass; may be repeated")
+    add("--mirror-ball", type=_ball, action="append", default=[], metavar="X,Y,Z,R",
+        help="add a mirror sphere; may be repeated")
+    add("--smooth", action="store_true", help="smooth normals for meshes that have none")
+    add("--on-invalid", choices=("raise", "drop"), default="raise",
+        help="triangles with vertices that are not finite")  # fmt: skip
+
+
+def _numbers(text, count):
+    parts = text.split(",")
+    if len(parts) != count:
+        raise argparse.ArgumentTypeError(f"need {count} numbers with commas, got {text!r}")
+    try:
+        return tuple(float(part) for part in parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"need {count} numbers with commas, got {text!r}"
+        ) from None
+
+
+def _vector(text):
+    return _numbers(text, 3)
+
+
+def _ball(text):
+    return _numbers(text, 4)
+
+
+def _size(text):
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"need WIDTHxHEIGHT, got {text!r}")
+    return int(width), int(height)
+
+
+def _scene(options):
+    scene = _load(options)
+    for x, y, z, radius in options.mirror_ball:
+        scene.add(scenes.mirror_ball((x, y, z), radius))
+    for pattern in options.mirror:
+        scene.mirror(pattern)
+    for pattern in options.glass:
+        scene.glass(pattern)
+    if options.light:
+        scene.set_lights([PointLight(position) for position in options.light])
+    return scene
+
+
+def _load(options):
+    name, _, argument = options.scene.partition(":")
+    if name in PROCEDURAL and not pathlib.Path(options.scene).exists():
+        if not argument:
+            return PROCEDURAL[name]()
+        return PROCEDURAL[name](int(argument) if argument.isdigit() else argument)
+    return load_scene(options.scene, smooth=options.smooth, on_invalid=options.on_invalid)
+
+
+def _camera(options, scene):
+    """The scene's camera with what the options change; fitted anew for another up axis."""
+    given = scene.camera
+    if options.up is not None and options.eye is None and options.target is None:
+        fov_y = given.fov_y if options.fov is None else options.fov
+        return Camera.fit(scene.bounds, options.up, fov_y)
+    return Camera.look_at(
+        given.eye if options.eye is None else options.eye,
+        given.target if options.target is None else options.target,
+        given.up if options.up is None else options.up,
+        given.fov_y if options.fov is None else options.fov,
+    )
+
+
+def _render(options):
+    images.check_suffix(options.output)
+    scene = _scene(options)
+    camera = _camera(options, scene)
+    renderer = Renderer(scene, options.method)
+    with tqdm(total=options.samples, unit="sample", disable=None) as bar:
+        frame = renderer.render(
+            camera,
+            options.size,
+            options.bounces,
+            samples=options.samples,
+            progress=lambda _done, _all: bar.update(),
+        )
+    frame.save(options.output)
+    print(f"{options.output}: {frame.statistics.rays} secondary rays, {options.method}")
+    if not options.verify:
+        return 0
+    return _report([options.method], options, scene, camera, None)
+
+
+def _compare(options):
+    names = [name.strip() for name in options.methods.split(",") if name.strip()]
+    from raystream.compare import EMBREE
+
+    for name in names:
+        if name not in (*methods(), EMBREE):
+            listed = ", ".join((*methods(), EMBREE))
+            raise ValueError(f"--methods: need some of {listed}, got {name!r}")
+    scene = _scene(options)
+    return _report(names, options, scene, _camera(options, scene), options.output)
+
+
+def _report(names, options, scene, camera, folder):
+    """Compare, print the table, write the pictures; 1 where a check failed."""
+    from raystream import compare  # Embree and scikit-image are needed here only
+
+    with tqdm(total=1 + 2 * len(names) - names.count(compare.EMBREE), disable=None) as bar:
+
+        def progress(line):
+            bar.set_description(line)
+            bar.update()
+
+        results, reference = compare.compare(
+            scene, names, camera, options.size, options.bounces, progress
+        )
+    print("\n".join(compare.table(results)))
+    if folder is not None:
+        _save_pictures(pathlib.Path(folder), results, reference)
+    failed = [result.method for result in results if not result.ok]
+    if failed:
+        print(f"raystream: not within the rules: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _save_pictures(folder, results, reference):
+    from raystream import compare
+
+    folder.mkdir(parents=True, exist_ok=True)
+    images.save(folder / "reference.png", reference)
+    for result in results:
+        images.save(folder / f"{result.method}.png", result.frame.image)
+        difference = compare.difference_image(result.frame.image, reference)
+        images.save(folder / f"{result.method}-difference.png", difference)
+    images.save(folder / "side-by-side.png", compare.side_by_side(results, reference))
+    print(f"pictures in {folder}; differences are {compare.AMPLIFICATION} times amplified")
+
+
+def _devices(_options):
+    found = devices()
+    if not found:
+        default_device()  # raises the message that says what to install
+    chosen = default_device()
+    for device in found:
+        mark = "*" if device == chosen else " "
+        memory = device.global_mem_size / 2**30
+        print(
+            f"{mark} {device.name.strip()} | {device.platform.name} | {device.version.strip()} | "
+            f"{device.max_compute_units} compute units, {memory:.1f} GiB"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

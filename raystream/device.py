@@ -1,0 +1,178 @@
+"""Choosing an OpenCL device, and the session (context, queue, programs, memory) on it."""
+
+import os
+import threading
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pyopencl.tools
+
+from raystream import pocl, program
+from raystream.errors import DeviceError
+from raystream.statistics import StageClock
+
+_NO_DEVICE = (
+    "no OpenCL device found: install a runtime, for instance PoCL for the CPU: "
+    "pip install pyopencl[pocl]"
+)
+
+
+def devices():
+    """All OpenCL devices of this machine.
+
+    Returns
+    -------
+    list of pyopencl.Device
+        In the order of the platforms; empty where there is none.
+    """
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # the loader raises where no platform is installed
+        return []
+    return [device for platform in platforms for device in platform.get_devices()]
+
+
+def default_device():
+    """The device named by ``$PYOPENCL_CTX``, else the first GPU, else the first device.
+
+    Raises
+    ------
+    DeviceError
+        There is no device, or ``$PYOPENCL_CTX`` names none.
+    """
+    found = devices()
+    if not found:
+        raise DeviceError(_NO_DEVICE)
+    wanted = os.environ.get("PYOPENCL_CTX")
+    if wanted:
+        try:
+            return cl.create_some_context(interactive=False).devices[0]
+        except (cl.Error, RuntimeError, IndexError, ValueError) as error:
+            raise DeviceError(f"PYOPENCL_CTX={wanted!r} names no OpenCL device: {error}") from None
+    return next((d for d in found if d.type & cl.device_type.GPU), found[0])
+
+
+def check_device(device):
+    """Refuse what cannot run raystream, in one line; make a PoCL device ready.
+
+    Raises
+    ------
+    TypeError, DeviceError
+    """
+    if not isinstance(device, cl.Device):
+        raise TypeError(f"device: need a pyopencl.Device (see raystream.devices()), got {device!r}")
+    major, minor = (int(x) for x in device.version.split()[1].split("."))
+    if (major, minor) < (1, 2):
+        raise DeviceError(f"{device.name}: need OpenCL 1.2 or newer, got {device.version}")
+    if "cl_khr_int64_base_atomics" not in device.extensions:
+        raise DeviceError(f"{device.name}: need 64-bit atomics (cl_khr_int64_base_atomics)")
+    if pocl.is_pocl(device):
+        pocl.name_target(device)
+        failure = pocl.failure(device)
+        if failure is not None:
+            raise DeviceError(f"{device.name}: {failure}")
+
+
+_thread = threading.local()
+
+
+def session(device=None, context=None):
+    """The session of this thread on a device, made at the first call and kept.
+
+    Parameters
+    ----------
+    device : pyopencl.Device, optional
+        Default: `default_device`.
+    context : pyopencl.Context, optional
+        A caller's own context, so that its arrays can be used in place.
+    """
+    sessions = _thread.__dict__.setdefault("sessions", {})
+    if device is None:
+        if not hasattr(_thread, "default"):
+            _thread.default = default_device()
+        device = _thread.default
+    if not isinstance(device, cl.Device):
+        check_device(device)
+    key = (device.int_ptr, None if context is None else context.int_ptr)
+    if key not in sessions:
+        check_device(device)
+        sessions[key] = Session(device, context)
+    return sessions[key]
+
+
+def session_of(array):
+    """The session of this thread that works in the context of a device array."""
+    context = array.queue.context
+    for known in _thread.__dict__.get("sessions", {}).values():
+        if known.context == context:
+            return known
+    return session(array.queue.device, context)
+
+
+class Session:
+    """A context and an in-order queue on one device, with its programs and its memory pool.
+
+    Not to be shared between threads: kernel objects hold their arguments. Use `session`.
+    """
+
+    def __init__(self, device, context=None):
+        self.device = device
+        self.context = cl.Context([device]) if context is None else context
+        self.queue = cl.CommandQueue(
+            self.context, device, properties=cl.command_queue_properties.PROFILING_ENABLE
+        )
+        self.pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
+        self._nothing = self.pool.allocate(64)
+        self.clock = StageClock()
+        self.cache = {}  # small device arrays that stages keep between calls, by their own keys
+        self._kernels = {}
+
+    def kernels(self, name, **defines):
+        """The kernels of ``cl/<name>``, built once per set of `defines`."""
+        key = (name, tuple(sorted(defines.items())))
+        if key not in self._kernels:
+            self._kernels[key] = program.build(self.context, name, key[1])
+        return self._kernels[key]
+
+    def launch(self, stage, kernel, size, *args, local=1):
+        """Run `kernel` over `size` work-items in groups of `local`, timed under `stage`.
+
+        `size` is rounded up to whole groups (a prime size is three times slower otherwise), so
+        kernels guard their index. Arrays are passed as their buffers. A size of 0 launches nothing.
+        """
+        if size == 0:
+            return
+        buffers = [self._buffer(a) if isinstance(a, cl.array.Array) else a for a in args]
+        rounded = -(-size // local) * local
+        self.clock.record(stage, kernel(self.queue, (rounded,), (local,), *buffers))
+
+    def _buffer(self, array):
+        # An empty array has no buffer, and PoCL ends the process where a kernel's argument is null.
+        return array.data if array.size else self._nothing
+
+    def empty(self, shape, dtype):
+        """An uninitialised device array from the pool."""
+        return cl.array.Array(self.queue, shape, np.dtype(dtype), allocator=self.pool)
+
+    def fill(self, stage, array, value):
+        """Set every element of `array` to `value`."""
+        if array.nbytes:
+            pattern = np.asarray(value, array.dtype)
+            event = cl.enqueue_fill_buffer(self.queue, array.base_data, pattern, 0, array.nbytes)
+            self.clock.record(stage, event)
+
+    def upload(self, stage, array, target=None):
+        """Copy a contiguous numpy array to the device, into `target` where one is given."""
+        array = np.ascontiguousarray(array)
+        target = self.empty(array.shape, array.dtype) if target is None else target
+        if array.nbytes:
+            # The event keeps `array` alive until the clock lets go of it.
+            event = cl.enqueue_copy(self.queue, target.base_data, array, is_blocking=False)
+            self.clock.record(stage, event)
+        return target
+
+    def finish(self):
+        """Wait for all launches; return the seconds by stage since the last call."""
+        self.queue.finish()
+        return self.clock.take()

@@ -1,0 +1,124 @@
+"""Final ray-triangle intersection and resolving hits (cl/intersect.cl)."""
+
+import dataclasses
+
+import numpy as np
+import pyopencl.array as cla
+
+from raystream.statistics import FINAL_INTERSECTION
+from raystream.stream import CHUNKS
+
+_LOCAL = 64
+_MISS = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+
+@dataclasses.dataclass
+class HitStream:
+    """Closest hits on the device, one per ray.
+
+    Attributes
+    ----------
+    t : Array of shape (n,) float32
+        inf where missed.
+    triangle : Array of shape (n,) uint32
+        Flat triangle number of the scene, 0xffffffff where missed.
+    u, v : Array of shape (n,) float32
+        Weights of the triangle's second and third vertex, 0 where missed.
+    """
+
+    t: cla.Array
+    triangle: cla.Array
+    u: cla.Array
+    v: cla.Array
+
+    @classmethod
+    def empty(cls, session, count):
+        """Uninitialised hits of `count` rays."""
+        types = (np.float32, np.uint32, np.float32, np.float32)
+        return cls(*(session.empty(count, t) for t in types))
+
+
+def no_hits(session, count):
+    """The key of every ray set to a miss: where `intersect_pairs` starts from."""
+    closest = session.empty(count, np.uint64)
+    session.fill(FINAL_INTERSECTION, closest, _MISS)
+    return closest
+
+
+def not_blocked(session, count):
+    """The flag of every ray set to free: where `occlude_pairs` starts from."""
+    blocked = session.empty(count, np.uint8)
+    session.fill(FINAL_INTERSECTION, blocked, 0)
+    return blocked
+
+
+def test_pairs(session, kernel, pairs, rays_per_node, slots, rays, triangles, result, traversal):
+    """Run `kernel` ("intersect_pairs" or "occlude_pairs") over the last stream of a traversal."""
+    kernels = session.kernels("intersect.cl", CHUNKS=CHUNKS)
+    reduction = traversal.reduction
+    session.launch(
+        FINAL_INTERSECTION,
+        kernels[kernel],
+        CHUNKS,
+        pairs.length,
+        pairs.pairs,
+        np.uint32(rays_per_node),
+        np.uint32(slots.shape[0]),
+        slots,
+        rays.org_tnear,
+        rays.dir_tfar,
+        triangles,
+        result,
+        reduction.chunk_tests,
+        reduction.chunk_hits,
+    )
+    session.launch(
+        FINAL_INTERSECTION,
+        kernels["sum_final"],
+        1,
+        pairs.length,
+        reduction.chunk_tests,
+        reduction.chunk_hits,
+        traversal.counts,
+        np.uint32(traversal.counts.shape[0] - 1),
+    )
+
+
+def resolve(session, closest, rays, triangles):
+    """Hits from the keys that `intersect_pairs` or `intersect_brute` left."""
+    hits = HitStream.empty(session, len(rays))
+    session.launch(
+        FINAL_INTERSECTION,
+        session.kernels("intersect.cl", CHUNKS=CHUNKS)["resolve_hits"],
+        len(rays),
+        np.uint32(len(rays)),
+        closest,
+        rays.org_tnear,
+        rays.dir_tfar,
+        triangles,
+        hits.t,
+        hits.triangle,
+        hits.u,
+        hits.v,
+        local=_LOCAL,
+    )
+    return hits
+
+
+def split_ids(session, hits, geometry):
+    """(geom_id, prim_id) of the hits, int32 arrays of shape (n,), -1 where missed."""
+    count = hits.triangle.shape[0]
+    geom_id, prim_id = session.empty(count, np.int32), session.empty(count, np.int32)
+    session.launch(
+        FINAL_INTERSECTION,
+        session.kernels("intersect.cl", CHUNKS=CHUNKS)["split_ids"],
+        count,
+        np.uint32(count),
+        hits.triangle,
+        geometry.geom_ids,
+        geometry.first_prims,
+        geom_id,
+        prim_id,
+        local=_LOCAL,
+    )
+    return geom_id, prim_id

@@ -1,0 +1,185 @@
+"""Is PoCL usable here? Found out in a child process, once per machine, before work starts.
+
+Two faults of the PoCL 3.0 wheel end a process or stop every build; Python cannot catch the first:
+
+* The last step of each compile runs the system's linker (``ld ... -lgcc -lgcc_s -lc``). Where the
+  linker or these libraries are missing, PoCL **aborts the process** inside the first launch.
+* The wheel carries LLVM 14, which does not know processors newer than itself (AMD Zen 4 and 5,
+  for one). LLVM then calls the processor ``generic``, a name that PoCL's own compiler refuses:
+  ``error: unknown target CPU 'generic'`` (github.com/pocl/pocl/issues/1049). PoCL offers no
+  setting for it, but keeps the name as a string that it reads at each build: `name_target`
+  replaces that one pointer by the name of the x86-64 level that the processor has. It acts only
+  where PoCL itself says ``generic``, and the child process proves the result before this process
+  relies on it.
+
+Run as a script (``python pocl.py PLATFORM DEVICE``) this file is the check itself.
+"""
+
+import ctypes
+import hashlib
+import os
+import pathlib
+import subprocess
+import sys
+
+import pyopencl as cl
+
+PLATFORM_NAME = "Portable Computing Language"
+_CHECK_SECONDS = 120
+_TRIPLE = b"x86_64-unknown-linux-gnu"
+_UNKNOWN_TARGET = b"generic"
+_STRUCT_BYTES = 1024  # the pointer lies 640 bytes into PoCL 3.0's device structure
+
+# The x86-64 levels of the psABI, best first, with the /proc/cpuinfo flags that each needs.
+_X86_64_LEVELS = (
+    (b"x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    (b"x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}),
+    (b"x86-64-v2", {"cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"}),
+    (b"x86-64", set()),
+)
+_names = {level: ctypes.create_string_buffer(level) for level, _ in _X86_64_LEVELS}
+
+
+def is_pocl(device):
+    """Whether `device` belongs to PoCL."""
+    return device.platform.name == PLATFORM_NAME
+
+
+def name_target(device):
+    """Name the processor to PoCL where its compiler does not know it; return the name or None.
+
+    Parameters
+    ----------
+    device : pyopencl.Device
+        Any device; one that is not PoCL's, or whose processor PoCL knows, is left alone.
+
+    Returns
+    -------
+    bytes or None
+        The LLVM target that now stands, None where nothing was changed.
+    """
+    if not (is_pocl(device) and device.version.endswith("-generic")):
+        return None
+    address = _target_pointer(device.int_ptr)
+    if address is None:
+        return None
+    flags = _cpu_flags()
+    level = next(name for name, needed in _X86_64_LEVELS if needed <= flags)
+    ctypes.c_void_p.from_address(address).value = ctypes.addressof(_names[level])
+    return level
+
+
+def _target_pointer(structure):
+    """Address of the `llvm_cpu` pointer: it follows the pointer to the target triple."""
+    try:
+        memory = os.open("/proc/self/mem", os.O_RDONLY)  # a wrong address is an error, not a crash
+    except OSError:
+        return None
+    try:
+        block = os.pread(memory, _STRUCT_BYTES, structure)
+        pointers = [int.from_bytes(block[i : i + 8], "little") for i in range(0, len(block), 8)]
+        for index in range(len(pointers) - 1):
+            if (
+                _string_at(memory, pointers[index]) == _TRIPLE
+                and _string_at(memory, pointers[index + 1]) == _UNKNOWN_TARGET
+            ):
+                return structure + 8 * (index + 1)
+    finally:
+        os.close(memory)
+    return None
+
+
+def _string_at(memory, address):
+    try:
+        return os.pread(memory, 64, address).split(b"\0")[0]
+    except (OSError, OverflowError):  # not a pointer
+        return b""
+
+
+def _cpu_flags():
+    for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("flags"):
+            return set(line.split(":", 1)[1].split())
+    return set()
+
+
+def failure(device):
+    """Why `device` cannot compile and run a kernel, in one line; None if it can.
+
+    The child process takes a few seconds; a success is remembered in the user's cache folder, under
+    a name made of everything that the answer depends on, so later starts cost one file look-up.
+    """
+    marker = _marker(device)
+    if marker is not None and marker.exists():
+        return None
+    message = _check_in_child(device)
+    if message is None and marker is not None:
+        _remember(marker)
+    return message
+
+
+def _marker(device):
+    import platformdirs
+
+    linker = next(
+        (p for d in os.get_exec_path() if (p := pathlib.Path(d, "ld")).exists()), pathlib.Path()
+    )
+    facts = (device.name, device.version, device.driver_version, cl.VERSION_TEXT, str(linker))
+    digest = hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+    return pathlib.Path(platformdirs.user_cache_dir("raystream"), f"pocl-{digest}")
+
+
+def _remember(marker):
+    try:
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
+    except OSError:
+        pass  # a read-only home: the next process checks again, nothing is lost
+
+
+def _check_in_child(device):
+    platforms = cl.get_platforms()
+    platform = platforms.index(device.platform)
+    number = device.platform.get_devices().index(device)
+    # -P: this folder must not shadow the standard library's modules in the child.
+    command = [sys.executable, "-P", __file__, str(platform), str(number)]
+    try:
+        child = subprocess.run(
+            command, capture_output=True, text=True, timeout=_CHECK_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"PoCL did not build and run a test kernel within {_CHECK_SECONDS} seconds"
+    if child.returncode == 0:
+        return None
+    said = [line.strip() for line in (child.stderr + child.stdout).splitlines() if line.strip()]
+    detail = next((line for line in said if "error" in line.lower()), said[-1] if said else "")
+    if "target CPU" in detail:
+        return (
+            f"PoCL does not know this processor ({detail}); "
+            "install another OpenCL runtime, for instance: pip install intel-opencl-rt"
+        )
+    return (
+        "PoCL cannot compile a kernel; it needs the system's linker and C library: install "
+        "binutils and gcc (Debian: apt-get install gcc libc6-dev); "
+        f"its process ended with {child.returncode}: {detail}"
+    )
+
+
+def _main(platform, number):
+    """Build and run one kernel on the device, in the child process."""
+    device = cl.get_platforms()[platform].get_devices()[number]
+    name_target(device)
+    context = cl.Context([device])
+    queue = cl.CommandQueue(context)
+    program = cl.Program(
+        context, "kernel void probe(global uint *out) { out[get_global_id(0)] = 42; }"
+    ).build()
+    out = cl.Buffer(context, cl.mem_flags.READ_WRITE, 4 * 64)
+    program.probe(queue, (64,), (64,), out)
+    result = bytearray(4 * 64)
+    cl.enqueue_copy(queue, result, out)
+    return 0 if result == bytes([42, 0, 0, 0]) * 64 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(_main(int(sys.argv[1]), int(sys.argv[2])))

@@ -1,0 +1,150 @@
+"""Rays on the device: the layout that every tracer takes, made from the caller's arrays."""
+
+import dataclasses
+
+import numpy as np
+import pyopencl.array as cla
+
+from raystream.checks import as_float_array, check_rows
+from raystream.statistics import RAY_CREATION
+
+_LOCAL = 64
+
+
+@dataclasses.dataclass
+class Rays:
+    """A ray stream.
+
+    Attributes
+    ----------
+    org_tnear, dir_tfar : pyopencl.array.Array of shape (n, 4) float32
+        Origin and tnear, direction and tfar. A ray with tfar < tnear is inactive: it hits nothing.
+    size : (int, int) or None
+        (width, height) where ray i belongs to pixel i of a screen, row by row from the top.
+    """
+
+    org_tnear: cla.Array
+    dir_tfar: cla.Array
+    size: tuple | None = None
+
+    def __len__(self):
+        return self.org_tnear.shape[0]
+
+
+def from_numpy(session, origins, directions, tnear, tfar):
+    """Check and upload rays given as arrays.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    origins, directions : array_like of shape (n, 3)
+        Finite; directions not zero, of any length.
+    tnear, tfar : float or array_like of shape (n,)
+        In units of the direction's length; tnear >= 0, tfar may be infinite.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Names the argument and the first element that is wrong.
+    """
+    origins = as_float_array("origins", origins, (None, 3))
+    directions = as_float_array("directions", directions, (len(origins), 3))
+    tnear = _per_ray("tnear", tnear, len(origins))
+    tfar = _per_ray("tfar", tfar, len(origins))
+    check_rows("origins", "finite values", np.isfinite(origins).all(axis=1))
+    check_rows("directions", "finite values", np.isfinite(directions).all(axis=1))
+    check_rows("directions", "a direction that is not zero", directions.any(axis=1))
+    check_rows("tnear", "a value of at least 0", np.atleast_1d(tnear >= 0))
+    check_rows("tfar", "a value that is not NaN", np.atleast_1d(~np.isnan(tfar)))
+    packed = np.empty((2, len(origins), 4), np.float32)
+    packed[0, :, :3], packed[0, :, 3] = origins, tnear
+    packed[1, :, :3], packed[1, :, 3] = directions, tfar
+    upload = [session.upload(RAY_CREATION, half) for half in packed]
+    return Rays(*upload)
+
+
+def _per_ray(name, value, count):
+    return as_float_array(name, value, () if np.ndim(value) == 0 else (count,))
+
+
+def from_device(session, origins, directions, tnear, tfar):
+    """Pack rays given as `pyopencl.array` arrays of the session's context; see `from_numpy`."""
+    count = origins.shape[0] if origins.ndim == 2 else -1
+    for name, array in (("origins", origins), ("directions", directions)):
+        _check_device_array(name, array, (count if count >= 0 else "n", 3))
+    bounds = [_per_ray_on_device(session, *x, count) for x in (("tnear", tnear), ("tfar", tfar))]
+    org_tnear = session.empty((count, 4), np.float32)
+    dir_tfar = session.empty((count, 4), np.float32)
+    if count == 0:
+        return Rays(org_tnear, dir_tfar)
+    first_invalid = session.empty(1, np.uint32)
+    session.fill(RAY_CREATION, first_invalid, count)
+    session.launch(
+        RAY_CREATION,
+        session.kernels("rays.cl")["pack_rays"],
+        count,
+        np.uint32(count),
+        origins,
+        directions,
+        *bounds[0],
+        *bounds[1],
+        org_tnear,
+        dir_tfar,
+        first_invalid,
+        local=_LOCAL,
+    )
+    index = int(first_invalid.get()[0])
+    if index < count:
+        raise ValueError(
+            "rays: need finite origins and directions, directions that are not zero, tnear >= 0 "
+            f"and tfar not NaN, not so at index {index}"
+        )
+    return Rays(org_tnear, dir_tfar)
+
+
+def from_camera(session, camera, size, offset=(0.5, 0.5)):
+    """The camera's rays through `offset` of every pixel of a (width, height) screen."""
+    width, height = size
+    org_tnear = session.empty((width * height, 4), np.float32)
+    dir_tfar = session.empty((width * height, 4), np.float32)
+    right, up, forward = camera.basis
+    tangent = np.tan(np.radians(camera.fov_y) / 2)
+    vectors = (camera.eye, right * tangent * width / height, up * tangent, forward)
+    session.launch(
+        RAY_CREATION,
+        session.kernels("rays.cl")["camera_rays"],
+        width * height,
+        np.uint32(width),
+        np.uint32(height),
+        np.array(offset, np.float32),
+        *(float4(v) for v in vectors),
+        org_tnear,
+        dir_tfar,
+        local=_LOCAL,
+    )
+    return Rays(org_tnear, dir_tfar, tuple(size))
+
+
+def float4(vector):
+    """Three numbers as a kernel's float4 argument, w = 0."""
+    return np.array([*vector, 0.0], np.float32)
+
+
+def _check_device_array(name, array, shape):
+    if not isinstance(array, cla.Array):
+        raise TypeError(f"{name}: need a pyopencl array like the origins, got {type(array)}")
+    if array.shape != shape:
+        raise ValueError(f"{name}: need shape {shape}, got {array.shape}")
+    if array.dtype != np.float32:
+        raise TypeError(f"{name}: need dtype float32 on the device, got {array.dtype}")
+    if not array.flags.c_contiguous or array.offset:
+        raise ValueError(f"{name}: need a C-contiguous device array that starts its buffer")
+
+
+def _per_ray_on_device(session, name, value, count):
+    """The array and the stride with which ray i reads it: 0 for one value for all."""
+    if isinstance(value, cla.Array):
+        _check_device_array(name, value, (count,))
+        return value, np.uint32(1)
+    value = np.atleast_1d(_per_ray(name, value, count))
+    return session.upload(RAY_CREATION, value), np.uint32(len(value) > 1)

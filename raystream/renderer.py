@@ -1,0 +1,215 @@
+"""The frame: primary visibility by rasterisation, then Whitted's recursion over ray streams."""
+
+import dataclasses
+
+import numpy as np
+
+from raystream import device as devices
+from raystream import image as images
+from raystream import intersect, rays
+from raystream.camera import Camera, check_size
+from raystream.checks import check_count
+from raystream.geometry import Geometry
+from raystream.host_tracer import HostTracer
+from raystream.intersect import HitStream
+from raystream.rasterize import Rasterizer
+from raystream.scene import as_scene
+from raystream.shade import Shader
+from raystream.statistics import SHADING, Statistics
+from raystream.tracer import Tracer
+
+# The R2 sequence (Roberts 2018): sample k of a pixel is frac(1/2 + k * these), sample 0 its centre.
+_R2 = np.array([0.7548776662466927, 0.5698402909980532])
+
+
+@dataclasses.dataclass
+class Frame:
+    """A rendered picture.
+
+    Attributes
+    ----------
+    image : (height, width, 3) float32
+        Linear RGB, top row first.
+    depth : (height, width) float32
+        Distance along the view direction of the first sample's primary hit, inf where none.
+    geom_id, prim_id : (height, width) int32
+        Of that hit, -1 where none.
+    statistics : raystream.statistics.Statistics
+        Summed over all ray streams of the frame.
+    """
+
+    image: np.ndarray
+    depth: np.ndarray
+    geom_id: np.ndarray
+    prim_id: np.ndarray
+    statistics: Statistics
+
+    def save(self, path):
+        """Write the image by suffix: .png and .jpg in sRGB, .exr and .npy linear."""
+        images.save(path, self.image)
+
+
+def render(
+    scene,
+    camera=None,
+    size=(512, 512),
+    method="rsh",
+    max_bounces=2,
+    shadows=True,
+    samples=1,
+    device=None,
+    progress=None,
+    **options,
+):
+    """Render a scene: see `Renderer`, which keeps its state between frames.
+
+    Parameters
+    ----------
+    scene : raystream.Scene, trimesh.Trimesh or trimesh.Scene
+    camera : raystream.Camera, optional
+        Default: the scene's.
+    size : (int, int)
+        (width, height) in pixels.
+    method : str or tracer
+        One of `methods`, a `Tracer`, or an object of the same protocol, such as an `EmbreeTracer`.
+    max_bounces : int
+        Generations of reflection and refraction rays.
+    shadows : bool
+        Trace shadow rays; otherwise every light reaches every surface that faces it.
+    samples : int
+        Samples per pixel.
+    device : pyopencl.Device, optional
+    progress : callable, optional
+        Called with (samples done, samples) after each sample.
+    **options
+        Of the method, and `memory_limit`.
+
+    Returns
+    -------
+    Frame
+
+    Raises
+    ------
+    ValueError, TypeError
+        Names the argument, what was wanted and what came.
+    """
+    scene = as_scene(scene)
+    renderer = Renderer(scene, method, device, **options)
+    return renderer.render(camera, size, max_bounces, shadows, samples, progress)
+
+
+class Renderer:
+    """Renders frames of one scene by one tracer; buffers and shading data stay on the device.
+
+    Parameters
+    ----------
+    scene, method, device, **options
+        As for `render`.
+    """
+
+    def __init__(self, scene, method="rsh", device=None, **options):
+        self.scene = as_scene(scene)
+        self._tracer = _tracer(self.scene, method, device, options)
+        self._session = devices.session(device)
+        geometry = (
+            self._tracer.geometry(self._session)
+            if isinstance(self._tracer, Tracer)
+            else Geometry(self._session, self.scene)
+        )
+        self._geometry = geometry
+        self._rasterizer = Rasterizer(self._session)
+        self._shader = Shader(self._session, geometry, self.scene)
+
+    def render(
+        self,
+        camera=None,
+        size=(512, 512),
+        max_bounces=2,
+        shadows=True,
+        samples=1,
+        progress=None,
+    ):
+        """Render one frame; parameters and result as for `raystream.render`."""
+        camera = self.scene.camera if camera is None else camera
+        if not isinstance(camera, Camera):
+            raise TypeError(f"camera: need a raystream.Camera, got {type(camera).__name__}")
+        width, height = check_size(size)
+        check_count("max_bounces", max_bounces, least=0)
+        check_count("samples", samples)
+        if isinstance(self._tracer, Tracer):
+            self._tracer.geometry(self._session)  # takes vertices updated since the last frame
+        statistics = Statistics(triangles=self.scene.num_triangles)
+        image = self._session.empty((width * height, 4), np.float32)
+        self._session.fill(SHADING, image, 0)
+        visible = None
+        for sample in range(samples):
+            offset = (0.5 + sample * _R2) % 1.0
+            hits = self._sample(
+                camera, (width, height), offset, max_bounces, shadows, image, statistics
+            )
+            visible = visible or self._visible(hits)
+            if progress is not None:
+                progress(sample + 1, samples)
+        linear = image.get().reshape(height, width, 4)[..., :3] / np.float32(samples)
+        statistics.stages = self._session.finish()
+        visible = [field.reshape(height, width) for field in visible]
+        return Frame(np.ascontiguousarray(linear), *visible, statistics)
+
+    def _sample(self, camera, size, offset, max_bounces, shadows, image, statistics):
+        """Add one sample per pixel to the image; returns the primary hits."""
+        session, shader = self._session, self._shader
+        stream = rays.from_camera(session, camera, size, offset)
+        weights = session.empty((len(stream), 4), np.float32)
+        session.fill(SHADING, weights, 1)
+        primary = hits = self._rasterize(camera, size, offset)
+        pending, bounce = [], 0
+        while True:
+            surfaces = shader.evaluate(hits, stream, weights, image)
+            self._light(stream, surfaces, weights, shadows, image, statistics)
+            if bounce < max_bounces:
+                spawned = shader.spawn(stream, surfaces, weights)
+                # The reflection is taken up first; waiting streams stay few, a pair per bounce.
+                pending += [(r, w, bounce + 1) for r, w, alive in reversed(spawned) if alive]
+            if not pending:
+                return primary
+            stream, weights, bounce = pending.pop()
+            hits = self._tracer.intersect_stream(session, stream)
+            statistics.add(self._tracer.statistics)
+
+    def _rasterize(self, camera, size, offset):
+        hits = self._rasterizer.render(
+            self._geometry.triangles, camera, size, offset, self._geometry.num_triangles
+        )
+        return HitStream(hits.t, hits.prim, hits.u, hits.v)
+
+    def _light(self, stream, surfaces, weights, shadows, image, statistics):
+        for light in range(self._shader.num_lights):
+            shadow_rays = self._shader.shadow_rays(light, surfaces, weights, stream.size)
+            if shadows:
+                blocked = self._tracer.occluded_stream(self._session, shadow_rays)
+                statistics.add(self._tracer.statistics)
+            else:
+                blocked = intersect.not_blocked(self._session, len(stream))
+            self._shader.add_light(light, blocked, stream, surfaces, weights, image)
+
+    def _visible(self, hits):
+        geom_id, prim_id = intersect.split_ids(self._session, hits, self._geometry)
+        return [hits.t.get(), geom_id.get(), prim_id.get()]
+
+
+def _tracer(scene, method, device, options):
+    if isinstance(method, str):
+        return Tracer(scene, method, device, **options)
+    if options:
+        raise ValueError(f"options are for methods given by name, got {', '.join(options)}")
+    if isinstance(method, Tracer):
+        if method.scene.num_triangles != scene.num_triangles:
+            raise ValueError(
+                f"method: the tracer holds {method.scene.num_triangles} triangles, "
+                f"the scene {scene.num_triangles}"
+            )
+        return method
+    for name in ("intersect", "occluded"):
+        if not callable(getattr(method, name, None)):
+            raise TypeError(f"method: need a name or a tracer, got {type(method).__name__}")
+    return HostTracer(method, scene)

@@ -1,0 +1,153 @@
+"""Method `rsh`: the ray-space hierarchy of Roger, Assarsson and Holzschuch (2007).
+
+Per call: the hierarchy is built bottom-up over the rays, and streams of (node, triangle) pairs are
+led from the root to the rays, reduced after each level; what is left is intersected exactly.
+
+Memory (section 3.4 of the paper): the streams share `memory_limit`. Whether all survivors of a
+level fit is known on the device before one of them is written. Where they do not, the levels below
+have nothing to do, and the host cuts the triangles into smaller batches and starts these from the
+top: in the same call, so nothing is lost, and since triangles do not depend on each other the sum
+of the batches' counts is what one batch would have counted.
+"""
+
+from raystream import intersect
+from raystream.checks import check_choice, check_count
+from raystream.errors import MemoryLimitError
+from raystream.hierarchy import ARITIES, RayHierarchy, leaf_slots
+from raystream.statistics import Statistics
+from raystream.stream import PAIR_BYTES, mask_bytes
+from raystream.traverse import Traversal, pairs_that_fit
+
+REDUCTIONS = ("segmented",)
+_FIRST_PAIRS = 1 << 20  # streams start with room for this many pairs and grow up to the limit
+
+
+class RayspaceTracer:
+    """Ray-space hierarchy over one geometry.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    geometry : raystream.geometry.Geometry
+    memory_limit : int
+        Bytes that the candidate streams may take.
+    arity : {4, 8, 16}
+        Children per node; 4 in the paper.
+    levels : int, optional
+        Node levels above the rays; the rays themselves are then not tested against the
+        triangles' spheres (as Reis et al. 2017 run it). Default: up to one root, and the rays
+        tested, as in the paper.
+    reduction : {"segmented"}
+
+    Raises
+    ------
+    ValueError
+        An option that there is not.
+    """
+
+    def __init__(
+        self, session, geometry, memory_limit, arity=4, levels=None, reduction="segmented"
+    ):
+        check_choice("arity", arity, ARITIES)
+        check_choice("reduction", reduction, REDUCTIONS)
+        if levels is not None:
+            check_count("levels", levels)
+        self.session, self.geometry = session, geometry
+        self._arity, self._levels, self._limit = arity, levels, memory_limit
+        self._most_pairs = min(
+            pairs_that_fit(memory_limit, arity),
+            session.device.max_mem_alloc_size // PAIR_BYTES,
+        )
+        self._capacity = min(_FIRST_PAIRS, self._most_pairs)
+
+    def intersect(self, rays):
+        """Closest hits of `rays`; returns (HitStream, Statistics)."""
+        closest = intersect.no_hits(self.session, len(rays))
+        statistics = self._trace("intersect_pairs", rays, closest)
+        hits = intersect.resolve(self.session, closest, rays, self.geometry.triangles)
+        return hits, statistics
+
+    def occluded(self, rays):
+        """Whether anything lies in each ray's segment; returns (uint8 Array, Statistics)."""
+        blocked = intersect.not_blocked(self.session, len(rays))
+        return blocked, self._trace("occlude_pairs", rays, blocked)
+
+    def _trace(self, kernel, rays, result):
+        slots = leaf_slots(self.session, rays)
+        hierarchy = RayHierarchy(self.session, rays, slots, self._arity, self._levels)
+        self._check_room(hierarchy)
+        batches = [(0, self.geometry.num_triangles)]
+        totals, done, peak = None, 0, 0
+        while batches:
+            first, last = batches.pop()
+            counts, overflow = self._run_batch(kernel, rays, hierarchy, result, first, last)
+            if overflow:
+                batches += self._cut(first, last, overflow)
+                continue
+            done += 1
+            totals = counts if totals is None else totals + counts
+            peak = max(peak, self._stream_bytes(counts))
+        return self._statistics(hierarchy, totals, done, peak)
+
+    def _check_room(self, hierarchy):
+        """A batch of one triangle must fit: at most one pair per leaf."""
+        if hierarchy.num_nodes[0] > self._most_pairs:
+            need = hierarchy.num_nodes[0] * (2 * PAIR_BYTES + mask_bytes(self._arity))
+            raise MemoryLimitError(
+                f"memory_limit: {hierarchy.num_nodes[0]} rays need at least {need} bytes, "
+                f"got {self._limit} (at most {self._most_pairs} pairs per stream on this device)"
+            )
+
+    def _run_batch(self, kernel, rays, hierarchy, result, first, last):
+        """One batch of triangles; returns (counts, survivors of a level that did not fit)."""
+        test_rays = self._levels is None
+        traversal = Traversal(self.session, self.geometry, hierarchy, self._capacity, test_rays)
+        pairs = traversal.run(first, last)
+        intersect.test_pairs(
+            self.session,
+            kernel,
+            pairs,
+            traversal.rays_per_node,
+            hierarchy.slots,
+            rays,
+            self.geometry.triangles,
+            result,
+            traversal,
+        )
+        return traversal.counts.get(), int(traversal.reduction.overflow.get()[0])
+
+    def _cut(self, first, last, survivors):
+        """The batches that replace one that overflowed; the streams grow first, up to the limit."""
+        if self._capacity < self._most_pairs:
+            self._capacity = min(max(2 * self._capacity, 2 * survivors), self._most_pairs)
+            return [(first, last)]
+        # `_check_room` made sure that a batch of one triangle never comes here.
+        pieces = max(2, -(-2 * survivors // self._capacity))
+        size = -(-(last - first) // pieces)
+        return [(i, min(i + size, last)) for i in range(first, last, size)][::-1]
+
+    def _stream_bytes(self, counts):
+        """Most bytes of streams in use: a level's input, its masks and its output."""
+        inputs = [0, *(int(n) for n in counts[1:, 2])]
+        per_input = PAIR_BYTES + mask_bytes(self._arity)
+        following = [*inputs[1:], 0]
+        return max(
+            per_input * a + PAIR_BYTES * b for a, b in zip(inputs, following, strict=True)
+        )
+
+    def _statistics(self, hierarchy, totals, batches, peak):
+        nodes = hierarchy.count_nodes()
+        order = nodes[::-1] if self._levels is None else nodes[:0:-1]
+        levels = [
+            {"nodes": n, "tests": int(t), "hits": int(h), "misses": int(t - h)}
+            for n, (t, h) in zip(order, totals[:-1, :2], strict=True)
+        ]
+        return Statistics(
+            levels=levels,
+            final_tests=int(totals[-1, 0]),
+            final_hits=int(totals[-1, 1]),
+            rays=nodes[0],
+            triangles=self.geometry.num_triangles,
+            peak_stream_bytes=peak,
+            batches=batches,
+        )

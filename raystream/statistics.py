@@ -1,0 +1,105 @@
+"""What a call counted and how long its stages took (the tables of the papers)."""
+
+import dataclasses
+
+# Stage names, as in the papers.
+GEOMETRY = "geometry"
+RASTERISATION = "rasterisation"
+RAY_CREATION = "ray creation"
+HIERARCHY_CREATION = "hierarchy creation"
+TRAVERSAL = "traversal"
+STREAM_REDUCTION = "stream reduction"
+FINAL_INTERSECTION = "final intersection"
+SHADING = "shading"
+
+
+@dataclasses.dataclass
+class Statistics:
+    """Counts and stage times of one call; counts are exact and do not change from run to run.
+
+    Attributes
+    ----------
+    levels : list of dict
+        Top level first: ``nodes`` (without null nodes), ``tests`` (node, triangle), ``hits`` and
+        ``misses`` of these tests.
+    mesh_tests : int
+        Tests of nodes against whole-mesh bounding spheres.
+    final_tests, final_hits : int
+        Ray-triangle tests and how many of them hit within the ray's segment.
+    rays, triangles : int
+        Rays that were traced (inactive ones are not), triangles of the scene.
+    peak_stream_bytes : int
+        The largest sum of candidate streams held at one time.
+    batches : int
+        Number of triangle batches the work was cut into to stay within `memory_limit`.
+    stages : dict of str to dict
+        Per stage ``device`` seconds (kernels running) and ``wall`` seconds (with launch gaps).
+    """
+
+    levels: list = dataclasses.field(default_factory=list)
+    mesh_tests: int = 0
+    final_tests: int = 0
+    final_hits: int = 0
+    rays: int = 0
+    triangles: int = 0
+    peak_stream_bytes: int = 0
+    batches: int = 0
+    stages: dict = dataclasses.field(default_factory=dict)
+
+    @property
+    def total_tests(self):
+        """Sum of mesh tests, level tests and final tests."""
+        return self.mesh_tests + self.final_tests + sum(level["tests"] for level in self.levels)
+
+    def to_dict(self):
+        """The attributes and `total_tests` as plain Python objects."""
+        return {**dataclasses.asdict(self), "total_tests": self.total_tests}
+
+    def add(self, other):
+        """Add the counts and times of `other`: the sum over a frame's ray streams.
+
+        Levels are matched from the leaves up, since streams differ in their number of levels.
+        """
+        for name in ("mesh_tests", "final_tests", "final_hits", "rays", "batches"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.triangles = max(self.triangles, other.triangles)
+        self.peak_stream_bytes = max(self.peak_stream_bytes, other.peak_stream_bytes)
+        missing = len(other.levels) - len(self.levels)
+        empty = {"nodes": 0, "tests": 0, "hits": 0, "misses": 0}
+        self.levels = [dict(empty) for _ in range(missing)] + self.levels
+        for mine, theirs in zip(reversed(self.levels), reversed(other.levels), strict=False):
+            for key in empty:
+                mine[key] += theirs[key]
+        for stage, seconds in other.stages.items():
+            mine = self.stages.setdefault(stage, {"wall": 0.0, "device": 0.0})
+            for key in mine:
+                mine[key] += seconds[key]
+
+
+class StageClock:
+    """Collects the events of launches by stage and turns them into seconds.
+
+    The queue is in order, so a launch's share of the wall clock is the time from the end of the
+    launch before it to its own end: device time plus the gap that its launch cost.
+    """
+
+    def __init__(self):
+        self._events = []
+
+    def record(self, stage, event):
+        """Note that `event` belongs to `stage`."""
+        self._events.append((stage, event))
+
+    def take(self):
+        """Seconds by stage since the last `take`; the events must have completed."""
+        stages, last_end = {}, None
+        for stage, event in self._events:
+            profile = event.profile
+            start, end = profile.start, profile.end
+            begin = profile.queued if last_end is None else last_end
+            seconds = stages.setdefault(stage, {"wall": 0.0, "device": 0.0})
+            seconds["device"] += (end - start) * 1e-9
+            seconds["wall"] += max(end - begin, end - start) * 1e-9
+            last_end = end
+        self._events.clear()
+        return stages

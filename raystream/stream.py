@@ -1,0 +1,102 @@
+"""Streams of (node, triangle) pairs on the device and their reduction (cl/stream.cl)."""
+
+import dataclasses
+
+import numpy as np
+import pyopencl.array as cla
+
+from raystream.statistics import STREAM_REDUCTION
+
+# Work-items per stream launch: enough to balance the cores, few enough to scan serially.
+CHUNKS = 512
+PAIR_BYTES = 8
+
+
+@dataclasses.dataclass
+class PairStream:
+    """Pairs (node, triangle) and, on the device, how many of them there are.
+
+    Attributes
+    ----------
+    pairs : Array of shape (capacity, 2) uint32
+    length : Array of shape (1,) uint32
+        Only the first `length` pairs mean anything.
+    """
+
+    pairs: cla.Array
+    length: cla.Array
+
+    @classmethod
+    def empty(cls, session, capacity):
+        """An uninitialised stream of room for `capacity` pairs."""
+        return cls(session.empty((capacity, 2), np.uint32), session.empty(1, np.uint32))
+
+
+def mask_bytes(arity):
+    """Bytes of one pair's survivor mask: a bit per child."""
+    return 2 if arity > 8 else 1
+
+
+class Reduction:
+    """Turns the survivor counts and masks of one pass into the next stream.
+
+    Attributes
+    ----------
+    chunk_tests, chunk_hits : Array of shape (CHUNKS,) uint32
+        What the producer counted per chunk.
+    offsets : Array of shape (CHUNKS,) uint32
+        Survivors before each chunk.
+    overflow : Array of shape (1,) uint64
+        Survivors of a pass that did not fit, 0 where all fitted.
+    """
+
+    def __init__(self, session, arity):
+        self.session, self.arity = session, arity
+        self._kernels = session.kernels("stream.cl", ARITY=arity, CHUNKS=CHUNKS)
+        self.chunk_tests = session.empty(CHUNKS, np.uint32)
+        self.chunk_hits = session.empty(CHUNKS, np.uint32)
+        self.offsets = session.empty(CHUNKS, np.uint32)
+        self.overflow = session.empty(1, np.uint64)
+        session.fill(STREAM_REDUCTION, self.overflow, 0)
+
+    def scan(self, source, target, counts, row, tasks=0):
+        """Offsets of the chunks' survivors, and the length of `target`; see cl/stream.cl.
+
+        Parameters
+        ----------
+        source : PairStream or None
+            The pass's input, None where it was a loop over `tasks` pairs that were never written.
+        target : PairStream
+        counts : Array of shape (rows, 3) uint64
+            Row `row` is the level's tests, hits and input length; tests and hits are added to.
+        row : int
+        """
+        self.session.launch(
+            STREAM_REDUCTION,
+            self._kernels["scan_chunks"],
+            1,
+            np.uint32(target.pairs.shape[0]),
+            np.uint64(tasks),
+            target.length if source is None else source.length,
+            self.chunk_tests,
+            self.chunk_hits,
+            self.offsets,
+            target.length,
+            self.overflow,
+            counts,
+            np.uint32(row),
+        )
+
+    def scatter(self, source, masks, target):
+        """Write the surviving children of `source`'s pairs to their places in `target`."""
+        self.session.launch(
+            STREAM_REDUCTION,
+            self._kernels["scatter_children"],
+            CHUNKS,
+            source.length,
+            source.pairs,
+            masks,
+            self.offsets,
+            target.length,
+            target.pairs,
+        )

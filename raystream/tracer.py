@@ -1,0 +1,207 @@
+"""`Tracer`: ray queries against a scene, by any of the methods."""
+
+import dataclasses
+import inspect
+
+import numpy as np
+import pyopencl.array as cla
+
+from raystream import device as devices
+from raystream import intersect, rays
+from raystream.brute import Brute
+from raystream.checks import as_float_array, check_choice, check_count, check_rows
+from raystream.geometry import Geometry
+from raystream.rsh import RayspaceTracer
+from raystream.scene import as_scene
+from raystream.statistics import Statistics
+
+_METHODS = {"brute": Brute, "rsh": RayspaceTracer}
+_COMMON = ("self", "session", "geometry", "memory_limit")
+_MEMORY_SHARE = 4  # the default memory_limit is this part of the device's memory
+
+
+def methods():
+    """The names that `Tracer` and `render` take as `method`."""
+    return list(_METHODS)
+
+
+@dataclasses.dataclass
+class Hits:
+    """Closest hits, one per ray, in the order of the rays.
+
+    Attributes
+    ----------
+    t : (n,) float32
+        In units of the direction's length, inf where missed.
+    prim_id, geom_id : (n,) int32
+        Face within its mesh and mesh within the scene, -1 where missed.
+    u, v : (n,) float32
+        The hit point is (1 - u - v) v0 + u v1 + v v2; 0 where missed.
+    """
+
+    t: np.ndarray
+    prim_id: np.ndarray
+    geom_id: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+
+
+class Tracer:
+    """Closest-hit and any-hit queries against a scene whose vertices may change every frame.
+
+    Parameters
+    ----------
+    scene : raystream.Scene, trimesh.Trimesh or trimesh.Scene
+        A mesh's faces and vertices are taken in the given order.
+    method : str
+        One of `methods`.
+    device : pyopencl.Device, optional
+        Default: ``$PYOPENCL_CTX`` if set, else the first GPU, else the CPU.
+    memory_limit : int, optional
+        Bytes that the candidates of one call may take; default: a quarter of the device's memory.
+    **options
+        Of the method: see `raystream.rsh.RayspaceTracer`.
+
+    Attributes
+    ----------
+    statistics : raystream.statistics.Statistics
+        Of the last call.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An unknown method or option (with the list), a scene that cannot be traced.
+    raystream.errors.DeviceError
+        No usable OpenCL device.
+    """
+
+    def __init__(self, scene, method="rsh", device=None, memory_limit=None, **options):
+        check_choice("method", method, methods())
+        _check_options(method, options)
+        if memory_limit is not None:
+            check_count("memory_limit", memory_limit)
+        self.scene = as_scene(scene)
+        self.method = method
+        self.statistics = Statistics(triangles=self.scene.num_triangles)
+        self._device, self._memory_limit, self._options = device, memory_limit, options
+        self._vertices, self._version = self.scene.vertices, 0
+        self._backends = {}  # per session: version of the vertices, geometry, method
+        self._backend(devices.session(device))
+
+    def intersect(self, origins, directions, tnear=0.0, tfar=np.inf):
+        """Closest hits.
+
+        Parameters
+        ----------
+        origins, directions : array_like or pyopencl.array.Array of shape (n, 3)
+            Directions of any length but zero.
+        tnear, tfar : float or array of shape (n,)
+            Hits with tnear <= t <= tfar count; a ray with tfar < tnear hits nothing.
+
+        Returns
+        -------
+        Hits
+            numpy arrays; device arrays where the origins are one.
+
+        Raises
+        ------
+        ValueError, TypeError
+            Names the argument and the first ray that is wrong.
+        """
+        on_device = isinstance(origins, cla.Array)
+        session, stream = self._rays(on_device, origins, directions, tnear, tfar)
+        hits = self.intersect_stream(session, stream)
+        geom_id, prim_id = intersect.split_ids(session, hits, self.geometry(session))
+        fields = (hits.t, prim_id, geom_id, hits.u, hits.v)
+        self.statistics.stages = session.finish()
+        return Hits(*(fields if on_device else (field.get() for field in fields)))
+
+    def occluded(self, origins, directions, tnear=0.0, tfar=np.inf):
+        """Whether anything is hit between tnear and tfar; parameters as in `intersect`.
+
+        Returns
+        -------
+        (n,) bool
+            A uint8 device array where the origins are a device array.
+        """
+        on_device = isinstance(origins, cla.Array)
+        session, stream = self._rays(on_device, origins, directions, tnear, tfar)
+        blocked = self.occluded_stream(session, stream)
+        self.statistics.stages = session.finish()
+        return blocked if on_device else blocked.get().astype(bool)
+
+    def update_vertices(self, vertices):
+        """A new frame: the same faces with other vertices.
+
+        Parameters
+        ----------
+        vertices : array_like of shape (n, 3)
+            In the mesh's own order; for scenes the meshes' vertices one after another.
+
+        Raises
+        ------
+        ValueError
+            Another shape, or values that are not finite.
+        """
+        vertices = as_float_array("vertices", vertices, self._vertices.shape)
+        check_rows("vertices", "finite values", np.isfinite(vertices).all(axis=1))
+        self._vertices, self._version = vertices, self._version + 1
+
+    def geometry(self, session):
+        """The scene's `Geometry` on a session's device, with the vertices of the last update."""
+        return self._backend(session).geometry
+
+    def intersect_stream(self, session, stream):
+        """Closest hits of a ray stream on the device, as a HitStream; sets the counts."""
+        backend = self._backend(session)
+        if len(stream) == 0 or self.scene.num_triangles == 0:
+            self.statistics = Statistics(triangles=self.scene.num_triangles)
+            keys = intersect.no_hits(session, len(stream))
+            return intersect.resolve(session, keys, stream, backend.geometry.triangles)
+        hits, self.statistics = backend.method.intersect(stream)
+        return hits
+
+    def occluded_stream(self, session, stream):
+        """Any hit of a ray stream on the device, as a uint8 array; sets the counts."""
+        backend = self._backend(session)
+        if len(stream) == 0 or self.scene.num_triangles == 0:
+            self.statistics = Statistics(triangles=self.scene.num_triangles)
+            return intersect.not_blocked(session, len(stream))
+        blocked, self.statistics = backend.method.occluded(stream)
+        return blocked
+
+    def _rays(self, on_device, origins, directions, tnear, tfar):
+        """The session to work in and the packed rays; a caller's context is worked in directly."""
+        if on_device:
+            session = devices.session_of(origins)
+            origins.queue.finish()  # the caller's queue is not ours: its work must be done
+            return session, rays.from_device(session, origins, directions, tnear, tfar)
+        session = devices.session(self._device)
+        return session, rays.from_numpy(session, origins, directions, tnear, tfar)
+
+    def _backend(self, session):
+        backend = self._backends.get(session)
+        if backend is None:
+            geometry = Geometry(session, self.scene)
+            limit = self._memory_limit or session.device.global_mem_size // _MEMORY_SHARE
+            method = _METHODS[self.method](session, geometry, limit, **self._options)
+            backend = self._backends[session] = _Backend(geometry, method, version=0)
+        if backend.version != self._version:
+            backend.geometry.update(self._vertices)
+            backend.version = self._version
+        return backend
+
+
+@dataclasses.dataclass
+class _Backend:
+    geometry: Geometry
+    method: object
+    version: int
+
+
+def _check_options(method, options):
+    known = [p for p in inspect.signature(_METHODS[method]).parameters if p not in _COMMON]
+    for name in options:
+        if name not in known:
+            listed = ", ".join(known) if known else "none"
+            raise ValueError(f"method {method!r} has no option {name!r}; its options: {listed}")

@@ -1,0 +1,95 @@
+"""Traversal of a ray-space hierarchy, level by level (cl/traverse.cl)."""
+
+import numpy as np
+
+from raystream.statistics import TRAVERSAL
+from raystream.stream import CHUNKS, PAIR_BYTES, PairStream, Reduction, mask_bytes
+
+COUNTS = 3  # tests, hits, stream length of a level: cl/stream.h
+
+
+class Traversal:
+    """Leads streams of (node, triangle) pairs from the top level of a hierarchy down.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    geometry : raystream.geometry.Geometry
+    hierarchy : raystream.hierarchy.RayHierarchy
+    capacity : int
+        Pairs that one stream can hold.
+    test_rays : bool
+        Whether the rays themselves (level 0) are tested against the triangles' spheres, as in the
+        ray-space hierarchy's paper, or the pairs of level 1 are handed on.
+
+    Attributes
+    ----------
+    counts : Array of shape (levels + 1, 3) uint64
+        Per level, top first, and last the final tests: tests, hits, input stream length.
+    """
+
+    def __init__(self, session, geometry, hierarchy, capacity, test_rays):
+        self.session, self.geometry, self.hierarchy = session, geometry, hierarchy
+        self._kernels = session.kernels("traverse.cl", ARITY=hierarchy.arity, CHUNKS=CHUNKS)
+        self.reduction = Reduction(session, hierarchy.arity)
+        self._last = 0 if test_rays else 1
+        self.levels = list(range(hierarchy.num_levels, self._last - 1, -1))
+        self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)
+        session.fill(TRAVERSAL, self.counts, 0)
+        self._streams = [PairStream.empty(session, capacity) for _ in range(2)]
+        mask_type = np.uint16 if mask_bytes(hierarchy.arity) == 2 else np.uint8
+        self._masks = session.empty(capacity, mask_type)
+
+    @property
+    def rays_per_node(self):
+        """Rays below a node of the last stream."""
+        return self.hierarchy.arity**self._last
+
+    def run(self, first, last):
+        """The stream of (node, triangle) pairs that survive all levels, triangles first..last."""
+        target = self._streams[0]
+        self._top(first, last, target)
+        for row in range(1, len(self.levels)):
+            source, target = target, self._streams[row % 2]
+            self._level(row, source, target)
+        return target
+
+    def _top(self, first, last, target):
+        level = self.levels[0]
+        args = (
+            np.uint32(self.hierarchy.num_nodes[level]),
+            np.uint32(first),
+            np.uint32(last),
+            self.hierarchy.blocks[level],
+            self.geometry.spheres,
+        )
+        reduction = self.reduction
+        chunks = (reduction.chunk_tests, reduction.chunk_hits)
+        self._launch("count_top", *args, *chunks)
+        tasks = self.hierarchy.num_nodes[level] * (last - first)
+        reduction.scan(None, target, self.counts, 0, tasks)
+        self._launch("write_top", *args, reduction.offsets, target.length, target.pairs)
+
+    def _level(self, row, source, target):
+        level, reduction = self.levels[row], self.reduction
+        self._launch(
+            "test_children",
+            source.length,
+            source.pairs,
+            self.hierarchy.blocks[level],
+            self.hierarchy.valid[level + 1],
+            self.geometry.spheres,
+            self._masks,
+            reduction.chunk_tests,
+            reduction.chunk_hits,
+        )
+        reduction.scan(source, target, self.counts, row)
+        reduction.scatter(source, self._masks, target)
+
+    def _launch(self, kernel, *args):
+        self.session.launch(TRAVERSAL, self._kernels[kernel], CHUNKS, *args)
+
+
+def pairs_that_fit(memory_limit, arity):
+    """Pairs per stream when two streams and a mask per pair share `memory_limit` bytes."""
+    return memory_limit // (2 * PAIR_BYTES + mask_bytes(arity))

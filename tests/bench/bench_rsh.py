@@ -1,0 +1,111 @@
+"""`rsh` against `brute` and where its time goes; run with `make bench`.
+
+pytest-benchmark prints the times; ratios and shares are printed by
+
+    RAYSTREAM_SCENES=... python tests/bench/bench_rsh.py
+"""
+
+import os
+import pathlib
+import statistics as mean
+import sys
+import time
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent.parent))
+
+from real_scenes import BUNNY, PATIO
+
+import raystream as rs
+from raystream import device
+from raystream.statistics import GEOMETRY, RASTERISATION
+
+SIZE = (512, 512)
+
+
+class _Recorder(rs.Tracer):
+    """Keeps the reflection rays of a frame."""
+
+    def intersect_stream(self, session, stream):
+        self.stream = stream
+        return super().intersect_stream(session, stream)
+
+
+def reflection_rays(real, folder):
+    """The scene, and the first bounce of its mirror at 512 x 512, on the device."""
+    scene = real.load(folder)
+    recorder = _Recorder(scene)
+    rs.Renderer(scene, recorder).render(real.camera, SIZE, max_bounces=1, shadows=False)
+    return scene, recorder.stream
+
+
+@pytest.fixture(params=[BUNNY, PATIO], ids=lambda real: real.name)
+def reflections(request, scene_folder):
+    return reflection_rays(request.param, scene_folder)
+
+
+def trace(tracer, stream):
+    """One call, in seconds, and its counts."""
+    session = device.session()
+    session.finish()
+    start = time.perf_counter()
+    tracer.intersect_stream(session, stream)
+    stages = session.finish()
+    return time.perf_counter() - start, tracer.statistics, stages
+
+
+def test_reflections_by_rsh(benchmark, reflections):
+    scene, stream = reflections
+    tracer = rs.Tracer(scene, "rsh")
+    benchmark(trace, tracer, stream)
+
+
+def test_frame_of_the_demo_scene(benchmark):
+    renderer = rs.Renderer(rs.scenes.demo())
+    renderer.render(size=SIZE)
+    benchmark(renderer.render, size=SIZE)
+
+
+def median_time(tracer, stream, runs):
+    trace(tracer, stream)
+    return mean.median(trace(tracer, stream)[0] for _ in range(runs))
+
+
+def main():
+    folder = os.environ.get("RAYSTREAM_SCENES")
+    if not folder:
+        sys.exit("RAYSTREAM_SCENES does not name the folder of test scenes")
+    for real in (BUNNY, PATIO):
+        scene, stream = reflection_rays(real, folder)
+        tracer = rs.Tracer(scene, "rsh")
+        rsh = median_time(tracer, stream, 9)
+        brute = median_time(rs.Tracer(scene, "brute"), stream, 3)
+        _, counts, stages = trace(tracer, stream)
+        print(f"{real.name}: {counts.rays} reflection rays, {scene.num_triangles} triangles")
+        print(f"  rsh {rsh * 1e3:.1f} ms, brute {brute * 1e3:.0f} ms: {brute / rsh:.0f} times")
+        left = counts.final_tests / counts.rays
+        print(f"  triangles left per ray after the last level: {left:.2f}")
+        total = sum(s["wall"] for s in stages.values())
+        for stage, seconds in stages.items():
+            print(f"  {stage}: {seconds['wall'] * 1e3:.1f} ms, {seconds['wall'] / total:.1%}")
+    frame_times()
+
+
+def frame_times():
+    renderer = rs.Renderer(rs.scenes.demo())
+    renderer.render(size=SIZE)
+    seconds = []
+    for _ in range(7):
+        start = time.perf_counter()
+        frame = renderer.render(size=SIZE)
+        seconds.append(time.perf_counter() - start)
+    print(f"demo at 512 x 512: {np.median(seconds) * 1e3:.0f} ms a frame after the first")
+    for stage, times in frame.statistics.stages.items():
+        if stage not in (GEOMETRY, RASTERISATION):
+            print(f"  {stage}: {times['wall'] * 1e3:.1f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""The real scenes of the tests and benchmarks: each with a camera, one mirror and one point light.
+
+The files are not part of the repository: `$RAYSTREAM_SCENES` names their folder.
+"""
+
+import dataclasses
+import pathlib
+
+import raystream as rs
+
+
+@dataclasses.dataclass(frozen=True)
+class RealScene:
+    """How to set up one file; `ball`: mirror sphere x, y, z, radius; `mirror`: name pattern."""
+
+    path: str
+    eye: tuple
+    target: tuple
+    light: tuple
+    fov_y: float = 45.0
+    up: tuple = (0, 1, 0)
+    ball: tuple | None = None
+    mirror: str | None = None
+
+    @property
+    def name(self):
+        return pathlib.Path(self.path).stem
+
+    def load(self, folder):
+        """The scene, ready to render."""
+        scene = rs.load_scene(pathlib.Path(folder) / self.path)
+        if self.ball is not None:
+            scene.add(rs.scenes.mirror_ball(self.ball[:3], self.ball[3]))
+        if self.mirror is not None:
+            scene.mirror(self.mirror)
+        scene.set_lights([rs.PointLight(self.light)])
+        return scene
+
+    @property
+    def camera(self):
+        return rs.Camera.look_at(self.eye, self.target, self.up, self.fov_y)
+
+
+BUNNY = RealScene(
+    "bunny/bunny-69451.ply", (0, 0.11, 0.35), (-0.017, 0.11, 0), (0.2, 0.4, 0.4), mirror="*"
+)
+PATIO = RealScene(
+    "sponza/sponza-dabrovic.obj", (-12, 4, 0), (-11, 3.95, 0.1), (-2, 9, 0), fov_y=60,
+    ball=(-6, 3, 0.3, 1.5),
+)  # fmt: skip
+REAL_SCENES = [
+    BUNNY,
+    RealScene(
+        "dragon/dragon-47794.ply", (0, 0.12, 0.4), (-0.006, 0.125, 0), (0.2, 0.4, 0.4),
+        ball=(0.07, 0.075, 0.07, 0.03),
+    ),
+    PATIO,
+    RealScene(
+        "office/mgf-office.glb", (1.6, 3.0, -1.2), (1.0, 2.65, -0.2), (0, 3.6, 0.3), fov_y=70,
+        ball=(0.4, 2.2, 0.9, 0.3),
+    ),
+    RealScene(
+        "bart-kitchen/bart-kitchen.glb", (4.5, 1.2, 3.2), (1.0, 0.2, -1.0), (2.0, 2.3, 0.5),
+        fov_y=60, ball=(2.2, 0.4, 0.6, 0.4),
+    ),
+    RealScene(
+        "cornell-box/cornell-box-measured.obj", (278, 273, -800), (278, 273, 0), (278, 500, 200),
+        fov_y=39.31, mirror="tall*",
+    ),
+    RealScene(
+        "spd/gears-4.glb", (-1.1, -2.1, 2.6), (0, 0, 0), (2, -2.5, 2.5), up=(0, 0, 1),
+        ball=(0.2, -0.4, 1.2, 0.3),
+    ),
+    RealScene(
+        "fox/fox.glb", (-180, 60, 60), (0, 40, 0), (-150, 200, 150), ball=(20, 40, -50, 35)
+    ),
+]  # fmt: skip

@@ -1,0 +1,26 @@
+"""Random triangles and rays, for many tests."""
+
+import numpy as np
+
+import raystream as rs
+
+
+def triangle_soup(rng, count, size=0.2):
+    """A scene of `count` random triangles in the unit cube, in two meshes."""
+    corners = rng.random((count, 1, 3)) + size * (rng.random((count, 3, 3)) - 0.5)
+    halves = np.array_split(corners.astype(np.float32), 2)
+    return rs.Scene([mesh_of(f"soup-{k}", half) for k, half in enumerate(halves)])
+
+
+def mesh_of(name, corners):
+    """A mesh of unconnected triangles, (m, 3, 3)."""
+    vertices = corners.reshape(-1, 3)
+    faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    return rs.Mesh(vertices, faces, name=name)
+
+
+def random_rays(rng, count, spread=1.0):
+    """Rays that start in a cube around the unit cube, directions of any length."""
+    origins = (rng.random((count, 3)) * (1 + 2 * spread) - spread).astype(np.float32)
+    directions = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-3, 3, (count, 1))
+    return origins, directions.astype(np.float32)

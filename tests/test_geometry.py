@@ -1,0 +1,60 @@
+"""Triangles and their bounding spheres on the device."""
+
+import numpy as np
+import pytest
+from soup import mesh_of, triangle_soup
+
+import raystream as rs
+from raystream.geometry import Geometry
+
+COUNTS = [1, 2, 15, 16, 17, 31, 33, 1009]
+
+
+def spheres_of(geometry):
+    rows = geometry.spheres.get().transpose(0, 2, 1).reshape(-1, 4).astype(np.float64)
+    return rows[: geometry.num_triangles], rows[geometry.num_triangles :]
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_triangles_are_gathered_and_padding_has_no_radius(session, rng, count):
+    scene = triangle_soup(rng, count)
+    geometry = Geometry(session, scene)
+    corners = geometry.triangles.get().reshape(-1, 3, 4)[:count, :, :3]
+    np.testing.assert_array_equal(corners, scene.vertices[scene.faces])
+    _, padding = spheres_of(geometry)
+    assert len(padding) == -count % 16 and np.isneginf(padding[:, 3]).all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
+def test_spheres_hold_their_triangles_and_are_minimal(session, rng, offset):
+    corners = (rng.random((500, 3, 3)) + offset).astype(np.float32)
+    geometry = Geometry(session, rs.Scene([mesh_of("soup", corners)]))
+    spheres, _ = spheres_of(geometry)
+    exact = corners.astype(np.float64)
+    distance = np.linalg.norm(exact - spheres[:, None, :3], axis=2)
+    assert (distance <= spheres[:, 3:]).all()
+    sides = np.linalg.norm(exact - np.roll(exact, 1, axis=1), axis=2)
+    area = np.linalg.norm(np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0]), axis=1)
+    circumradius = sides.prod(axis=1) / (2 * area)
+    longest = sides.max(axis=1)
+    obtuse = 2 * longest**2 >= (sides**2).sum(axis=1)
+    smallest = np.where(obtuse, longest / 2, circumradius)
+    # Far from the origin the rounded centre costs up to a float32 step of the coordinates.
+    np.testing.assert_allclose(spheres[:, 3], smallest, rtol=1e-5, atol=1e-7 * offset)
+
+
+def test_degenerate_triangles_have_finite_spheres(session):
+    point, line = np.ones((3, 3)), np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2]])
+    corners = np.stack([point, line]).astype(np.float32)
+    spheres, _ = spheres_of(Geometry(session, rs.Scene([mesh_of("thin", corners)])))
+    np.testing.assert_allclose(spheres[:, :3], 1.0)
+    np.testing.assert_allclose(spheres[:, 3], [0.0, np.sqrt(3)], rtol=1e-5)
+
+
+def test_new_vertices_replace_the_old_ones(session, rng):
+    scene = triangle_soup(rng, 40)
+    geometry = Geometry(session, scene)
+    moved = scene.vertices + np.float32(0.5)
+    geometry.update(moved)
+    corners = geometry.triangles.get().reshape(-1, 3, 4)[:40, :, :3]
+    np.testing.assert_array_equal(corners, moved[scene.faces])

@@ -1,0 +1,169 @@
+"""The ray-space hierarchy as a tracer: nothing is lost, counts are exact, memory is bounded."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from soup import mesh_of, random_rays, triangle_soup
+
+import raystream as rs
+from raystream import device, rays
+from raystream.errors import MemoryLimitError
+
+FIELDS = ("t", "prim_id", "geom_id", "u", "v")
+
+
+def assert_same_hits(ours, reference):
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(ours, field), getattr(reference, field), field)
+
+
+def assert_nothing_lost(scene, origins, directions, tfar=np.inf, **options):
+    """`rsh` finds every (ray, triangle) hit that brute force finds: the counts are equal."""
+    rsh, brute = rs.Tracer(scene, "rsh", **options), rs.Tracer(scene, "brute")
+    arguments = (origins, directions, 0.0, tfar)
+    assert_same_hits(rsh.intersect(*arguments), brute.intersect(*arguments))
+    assert rsh.statistics.final_hits == brute.statistics.final_hits
+    blocked = brute.occluded(*arguments)
+    np.testing.assert_array_equal(rsh.occluded(*arguments), blocked)
+    return rsh.statistics
+
+
+@pytest.mark.parametrize("options", [
+    {}, {"arity": 8}, {"arity": 16}, {"levels": 1}, {"arity": 8, "levels": 2},
+    {"arity": 16, "levels": 5},
+])  # fmt: skip
+@pytest.mark.parametrize("count", [1, 3, 4, 5, 64, 65, 1009])
+def test_hits_equal_brute_force(rng, options, count):
+    scene = triangle_soup(rng, 300)
+    assert_nothing_lost(scene, *random_rays(rng, count), **options)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0.0, 1e-3, 0.1, 1.0]),  # spread of directions: parallel to all around
+    st.sampled_from([0.0, 1e-3, 1.0]),  # spread of origins: one point (zero-size nodes) to wide
+    st.sampled_from([1e-3, 0.05, 1.0]),  # size of triangles
+    st.sampled_from([(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 100.0)]),  # scale, offset
+)
+def test_no_hit_is_ever_lost(seed, angular, spatial, size, place):
+    rng = np.random.default_rng(seed)
+    scale, offset = place
+    corners = rng.random((97, 1, 3)) + size * (rng.random((97, 3, 3)) - 0.5)
+    corners = (scale * corners + offset).astype(np.float32)
+    scene = rs.Scene([mesh_of("soup", corners)])
+    origins = scale * (0.5 + rng.normal(size=3) + spatial * rng.normal(size=(130, 3))) + offset
+    aim = corners[rng.integers(0, 97, 130)].mean(axis=1) - origins
+    towards = aim[0] + angular * np.linalg.norm(aim[0]) * rng.normal(size=(130, 3))
+    mixed = np.where(rng.random((130, 1)) < 0.5, aim, towards)
+    directions = np.where(mixed.any(axis=1, keepdims=True), mixed, 1.0)
+    tfar = np.where(rng.random(130) < 0.5, np.inf, 2 * rng.random(130)).astype(np.float32)
+    assert_nothing_lost(scene, origins, directions, tfar)
+
+
+def test_rays_aimed_at_edges_and_vertices_of_a_closed_mesh_hit():
+    import trimesh
+
+    ball = trimesh.creation.icosphere(3)
+    weights = np.random.default_rng(3).random((len(ball.edges_unique), 1))
+    ends = ball.vertices[ball.edges_unique]
+    targets = np.concatenate([ball.vertices, weights * ends[:, 0] + (1 - weights) * ends[:, 1]])
+    origins = np.tile([0.1, -0.2, 0.05], (len(targets), 1))
+    for method in ("rsh", "brute"):
+        hits = rs.Tracer(ball, method).intersect(origins, targets - origins)
+        assert (hits.prim_id >= 0).all(), method
+
+
+def grid_of_rays(width, height):
+    camera = rs.Camera.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.5), fov_y=30.0)
+    return rays.from_camera(device.session(), camera, (width, height))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (8, 8), (33, 17), (64, 64)])
+def test_screens_of_any_size_with_holes(rng, session, size):
+    scene = triangle_soup(rng, 200)
+    stream = grid_of_rays(*size)
+    tfar = stream.dir_tfar.get()
+    tfar[rng.random(len(stream)) < 0.4, 3] = -1.0
+    stream.dir_tfar = session.upload("holes", tfar)
+    rsh, brute = rs.Tracer(scene, "rsh"), rs.Tracer(scene, "brute")
+    ours, theirs = (t.intersect_stream(session, stream) for t in (rsh, brute))
+    np.testing.assert_array_equal(ours.triangle.get(), theirs.triangle.get())
+    np.testing.assert_array_equal(ours.t.get(), theirs.t.get())
+    active = int((tfar[:, 3] >= 0).sum())
+    assert rsh.statistics.rays == brute.statistics.rays == active
+    assert rsh.statistics.final_hits == brute.statistics.final_hits
+
+
+def test_counts_follow_from_each_other(rng, session):
+    scene = triangle_soup(rng, 500)
+    tracer = rs.Tracer(scene, "rsh")
+    tracer.intersect_stream(session, grid_of_rays(64, 64))
+    counts = tracer.statistics
+    assert [level["nodes"] for level in counts.levels] == [1, 4, 16, 64, 256, 1024, 4096]
+    assert counts.levels[0]["tests"] == scene.num_triangles
+    for above, below in zip(counts.levels, counts.levels[1:], strict=False):
+        assert below["tests"] == 4 * above["hits"]
+        assert below["hits"] + below["misses"] == below["tests"]
+    assert counts.final_tests == counts.levels[-1]["hits"]
+    assert counts.total_tests == counts.final_tests + sum(x["tests"] for x in counts.levels)
+    assert counts.batches == 1 and counts.to_dict()["total_tests"] == counts.total_tests
+
+
+def test_limited_levels_end_with_all_rays_of_a_node(rng, session):
+    scene = triangle_soup(rng, 500)
+    tracer = rs.Tracer(scene, "rsh", arity=8, levels=2)
+    tracer.intersect_stream(session, grid_of_rays(64, 64))
+    counts = tracer.statistics
+    assert [level["nodes"] for level in counts.levels] == [64, 512]
+    assert counts.levels[0]["tests"] == 64 * scene.num_triangles
+    assert counts.levels[1]["tests"] == 8 * counts.levels[0]["hits"]
+    assert counts.final_tests == 8 * counts.levels[1]["hits"]
+
+
+def test_counts_are_the_same_from_run_to_run_and_in_any_number_of_batches(rng):
+    scene = triangle_soup(rng, 3000, size=0.5)
+    origins, directions = random_rays(rng, 2000)
+    unlimited = rs.Tracer(scene, "rsh")
+    hits = unlimited.intersect(origins, directions)
+    first = unlimited.statistics.to_dict()
+    assert first["batches"] == 1
+    limit = 100_000
+    limited = rs.Tracer(scene, "rsh", memory_limit=limit)
+    for _ in range(2):
+        assert_same_hits(limited.intersect(origins, directions), hits)
+        second = limited.statistics.to_dict()
+        assert second["batches"] > 1
+        assert second["peak_stream_bytes"] <= limit
+        for key in ("levels", "final_tests", "final_hits", "total_tests", "rays"):
+            assert second[key] == first[key], key
+
+
+def test_streams_grow_before_batches_are_cut(rng, monkeypatch):
+    from raystream import rsh
+
+    monkeypatch.setattr(rsh, "_FIRST_PAIRS", 64)
+    scene = triangle_soup(rng, 500, size=0.5)
+    tracer = rs.Tracer(scene, "rsh")
+    hits = tracer.intersect(*random_rays(np.random.default_rng(5), 500))
+    assert tracer.statistics.batches == 1
+    reference = rs.Tracer(scene, "brute").intersect(*random_rays(np.random.default_rng(5), 500))
+    assert_same_hits(hits, reference)
+
+
+def test_too_little_memory_is_one_clear_error(rng):
+    tracer = rs.Tracer(triangle_soup(rng, 50), "rsh", memory_limit=1000)
+    with pytest.raises(MemoryLimitError, match="memory_limit: 500 rays need at least 8500 bytes"):
+        tracer.intersect(*random_rays(rng, 500))
+
+
+def test_equal_distances_go_to_the_smaller_number():
+    triangle = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+    twice = mesh_of("twice", np.concatenate([triangle + [0, 0, 1], triangle, triangle]))
+    scene = rs.Scene([mesh_of("behind", triangle - [0, 0, 1]), twice, mesh_of("again", triangle)])
+    origins = np.tile([0.2, 0.2, 0.5], (70, 1))
+    for method in ("rsh", "brute"):
+        hits = rs.Tracer(scene, method).intersect(origins, [[0, 0, -1]] * 70)
+        assert set(hits.geom_id) == {1} and set(hits.prim_id) == {1}
+        assert set(hits.t) == {0.5}
