@@ -7,13 +7,6 @@
 
 #define MISS 0xffffffffffffffffUL
 
-inline int any16(int16 m)
-{
-    const int8 a = m.lo | m.hi;
-    const int4 b = a.lo | a.hi;
-    return (b.x | b.y) | (b.z | b.w);
-}
-
 // Lanes past the last ray, and inactive rays, get tfar = -1 and so never hit.
 inline RayFrame16 ray_frame16(uint first, uint num_rays, global const float4 *org_tnear,
                               global const float4 *dir_tfar)
@@ -63,7 +56,7 @@ kernel void intersect_brute(const uint num_rays, const uint num_triangles,
         global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)i;
         float16 edges[3], depths[3];
         const int16 inside = inside_edges16(&frame, v[0], v[1], v[2], edges, depths);
-        if (any16(inside)) {
+        if (MASK16(inside)) {
             const TriangleHit16 h = finish_hit16(&frame, inside, edges, depths);
             count -= h.hit;
             // A later triangle replaces an earlier one only if strictly nearer.
@@ -95,7 +88,7 @@ kernel void occlude_brute(const uint num_rays, const uint num_triangles,
         global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)i;
         float16 edges[3], depths[3];
         const int16 inside = inside_edges16(&frame, v[0], v[1], v[2], edges, depths);
-        if (any16(inside))
+        if (MASK16(inside))
             count -= finish_hit16(&frame, inside, edges, depths).hit;
     }
     int lanes[16] __attribute__((aligned(64)));

@@ -6,16 +6,9 @@
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#define INVALID 0xffffffffu
+#include "simd.h"
 
-// One rounding, inline. PoCL compiles the built-in fma() to a call of its library.
-#if defined(POCL_DEVICE_ADDRESS_BITS) && defined(__FMA__) && defined(__AVX512F__)
-#define FMA(a, b, c) __builtin_fmaf(a, b, c)
-#define FMA16(a, b, c) __builtin_ia32_vfmaddps512_mask(a, b, c, (short)-1, 4)
-#else
-#define FMA(a, b, c) fma(a, b, c)
-#define FMA16(a, b, c) fma(a, b, c)
-#endif
+#define INVALID 0xffffffffu
 
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 #define MAX(a, b) ((a) > (b) ? (a) : (b))

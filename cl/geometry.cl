@@ -2,8 +2,9 @@
 //
 // Output layout:
 //   triangles  three float4 a triangle: v0, v1, v2, w unused
-//   spheres    per block of 16 triangles four float16 rows: centre x, y, z, radius
-// Both are padded to whole blocks; padding has radius -inf, which no test of cl/node.h keeps.
+//   spheres       a float4 a triangle: centre, radius; for tests of scattered triangles
+//   sphere_rows   per block of 16 triangles four float16 rows: centre x, y, z, radius; for runs
+// All are padded to whole blocks; padding has radius -inf, which no test of cl/node.h keeps.
 //
 // Spheres are minimal (design, section 5): the circumcircle's, or that of the longest edge where the
 // triangle is obtuse. The centre is rounded, so the radius is measured from the rounded centre to the
@@ -38,7 +39,7 @@ inline float4 bounding_sphere(float4 a, float4 b, float4 c)
 // One work-item gathers one block of 16 triangles.
 kernel void gather_triangles(const uint num_triangles, global const float *restrict vertices,
                              global const uint *restrict faces, global float4 *restrict triangles,
-                             global float *restrict spheres)
+                             global float4 *restrict spheres, global float *restrict sphere_rows)
 {
     const uint block = get_global_id(0);
     for (uint lane = 0; lane < 16; lane++) {
@@ -54,7 +55,8 @@ kernel void gather_triangles(const uint num_triangles, global const float *restr
         }
         for (uint corner = 0; corner < 3; corner++)
             triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = v[corner];
-        global float *rows = spheres + 64 * (ulong)block + lane;
+        spheres[i] = sphere;
+        global float *rows = sphere_rows + 64 * (ulong)block + lane;
         rows[0] = sphere.x;
         rows[16] = sphere.y;
         rows[32] = sphere.z;

@@ -3,7 +3,7 @@
 // The closest hit of a ray is the 64-bit minimum over (bits of t, triangle): t >= 0, so its bits sort
 // like its value, and equal distances go to the smaller triangle, whatever the order of work.
 //
-// Build-time constants: CHUNKS.
+// Build-time constants: CHUNKS, ARITY.
 
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 #pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
@@ -32,7 +32,7 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
     {                                                                                              \
         const uint n = *length;                                                                    \
         uint tests = 0, hits = 0;                                                                  \
-        for (uint i = chunk_begin(n), end = chunk_end(n); i < end; i++) {                          \
+        for (uint i = chunk_begin(n, 1), end = chunk_end(n, 1); i < end; i++) {                          \
             const Pair pair = pairs[i];                                                            \
             for (uint k = 0; k < rays_per_node; k++) {                                             \
                 const uint ray = ray_of(pair.x * rays_per_node + k, num_slots, slots);             \

@@ -24,34 +24,26 @@
 #define CONCAT_(a, b) a##b
 #define CONCAT(a, b) CONCAT_(a, b)
 #define FLOATN CONCAT(float, ARITY)
-#define INTN CONCAT(int, ARITY)
 
 #define NODE_ROWS 10
 #define SLACK 0x1p-19f
 #define NULL_REACH (-INFINITY)
 
-#define DEFINE_NODE_TEST(SUFFIX, F, I)                                                             \
-    inline F magnitude##SUFFIX(F x) { return x < 0.0f ? -x : x; }                                  \
-    inline I node_meets_sphere##SUFFIX(F cx, F cy, F cz, F r, F ax, F ay, F az, F cosine, F sine,  \
-                                       F reach, F px, F py, F pz, F d)                             \
-    {                                                                                              \
-        const F wx = px - cx, wy = py - cy, wz = pz - cz;                                          \
-        const F s = r + d + SLACK * (magnitude##SUFFIX(wx) + magnitude##SUFFIX(wy)                 \
-                                     + magnitude##SUFFIX(wz));                                     \
-        const F h = wx * ax + wy * ay + wz * az;                                                   \
-        const F kx = wy * az - wz * ay, ky = wz * ax - wx * az, kz = wx * ay - wy * ax;            \
-        const F p2 = kx * kx + ky * ky + kz * kz;                                                  \
-        const F q = h * sine + s;                                                                  \
-        const F far = reach + s;                                                                   \
-        const I in_cone = (q >= 0.0f) & (p2 * cosine * cosine <= q * q) & (h >= -s);               \
-        const I in_reach = (far >= 0.0f) & (wx * wx + wy * wy + wz * wz <= far * far);             \
-        return in_reach & (in_cone | (cosine <= 0.0f));                                            \
-    }
+inline float16 magnitude(float16 x) { return x < 0.0f ? -x : x; }
 
-#if ARITY == 4
-DEFINE_NODE_TEST(4, float4, int4)
-#elif ARITY == 8
-DEFINE_NODE_TEST(8, float8, int8)
-#endif
-DEFINE_NODE_TEST(16, float16, int16)
-#define NODES_MEET_SPHERE CONCAT(node_meets_sphere, ARITY)
+// Lane by lane; the arguments are the node's fields in the order of its rows, then P and d.
+inline int16 node_meets_sphere(float16 cx, float16 cy, float16 cz, float16 r, float16 ax, float16 ay,
+                               float16 az, float16 cosine, float16 sine, float16 reach, float16 px,
+                               float16 py, float16 pz, float16 d)
+{
+    const float16 wx = px - cx, wy = py - cy, wz = pz - cz;
+    const float16 s = r + d + SLACK * (magnitude(wx) + magnitude(wy) + magnitude(wz));
+    const float16 h = wx * ax + wy * ay + wz * az;
+    const float16 kx = wy * az - wz * ay, ky = wz * ax - wx * az, kz = wx * ay - wy * ax;
+    const float16 p2 = kx * kx + ky * ky + kz * kz;
+    const float16 q = h * sine + s;
+    const float16 far = reach + s;
+    const int16 in_cone = (q >= 0.0f) & (p2 * cosine * cosine <= q * q) & (h >= -s);
+    const int16 in_reach = (far >= 0.0f) & (wx * wx + wy * wy + wz * wz <= far * far);
+    return in_reach & (in_cone | (cosine <= 0.0f));
+}

@@ -20,8 +20,10 @@ class Geometry:
     num_triangles : int
     triangles : Array of shape (num_blocks * 16, 12) float32
         v0, v1, v2 as float4, the fourth component unused.
-    spheres : Array of shape (num_blocks, 4, 16) float32
-        Rows centre x, y, z and radius of 16 triangles.
+    spheres : Array of shape (num_blocks * 16, 4) float32
+        Centre and radius of each triangle's bounding sphere.
+    sphere_rows : Array of shape (num_blocks, 4, 16) float32
+        The same as rows x, y, z and radius of 16 triangles.
     geom_ids : Array of shape (num_triangles,) uint32
     first_prims : Array of shape (num_meshes + 1,) uint32
         First flat triangle of each mesh.
@@ -35,7 +37,8 @@ class Geometry:
         self.geom_ids = session.upload(GEOMETRY, scene.geom_ids.astype(np.uint32))
         self.first_prims = session.upload(GEOMETRY, scene.first_prims.astype(np.uint32))
         self.triangles = session.empty((self._num_blocks * _BLOCK, 12), np.float32)
-        self.spheres = session.empty((self._num_blocks, 4, _BLOCK), np.float32)
+        self.spheres = session.empty((self._num_blocks * _BLOCK, 4), np.float32)
+        self.sphere_rows = session.empty((self._num_blocks, 4, _BLOCK), np.float32)
         self._vertices = session.empty(scene.vertices.shape, np.float32)
         self.update(scene.vertices)
 
@@ -54,4 +57,5 @@ class Geometry:
             self.faces,
             self.triangles,
             self.spheres,
+            self.sphere_rows,
         )

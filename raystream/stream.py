@@ -32,9 +32,9 @@ class PairStream:
         return cls(session.empty((capacity, 2), np.uint32), session.empty(1, np.uint32))
 
 
-def mask_bytes(arity):
-    """Bytes of one pair's survivor mask: a bit per child."""
-    return 2 if arity > 8 else 1
+def group_size(arity):
+    """Pairs that one pass handles at a time: their children fill sixteen lanes (cl/stream.h)."""
+    return 16 // arity
 
 
 class Reduction:
@@ -97,6 +97,7 @@ class Reduction:
             source.pairs,
             masks,
             self.offsets,
+            self.chunk_hits,
             target.length,
             target.pairs,
         )

@@ -3,8 +3,9 @@
 import numpy as np
 
 from raystream.statistics import TRAVERSAL
-from raystream.stream import CHUNKS, PAIR_BYTES, PairStream, Reduction, mask_bytes
+from raystream.stream import CHUNKS, PAIR_BYTES, PairStream, Reduction, group_size
 
+UNIT = 16  # streams hold whole groups, whatever the arity
 COUNTS = 3  # tests, hits, stream length of a level: cl/stream.h
 
 
@@ -17,7 +18,7 @@ class Traversal:
     geometry : raystream.geometry.Geometry
     hierarchy : raystream.hierarchy.RayHierarchy
     capacity : int
-        Pairs that one stream can hold.
+        Pairs that one stream can hold, a multiple of `UNIT`.
     test_rays : bool
         Whether the rays themselves (level 0) are tested against the triangles' spheres, as in the
         ray-space hierarchy's paper, or the pairs of level 1 are handed on.
@@ -37,8 +38,7 @@ class Traversal:
         self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)
         session.fill(TRAVERSAL, self.counts, 0)
         self._streams = [PairStream.empty(session, capacity) for _ in range(2)]
-        mask_type = np.uint16 if mask_bytes(hierarchy.arity) == 2 else np.uint8
-        self._masks = session.empty(capacity, mask_type)
+        self._masks = session.empty(capacity // group_size(hierarchy.arity), np.uint16)
 
     @property
     def rays_per_node(self):
@@ -61,7 +61,7 @@ class Traversal:
             np.uint32(first),
             np.uint32(last),
             self.hierarchy.blocks[level],
-            self.geometry.spheres,
+            self.geometry.sphere_rows,
         )
         reduction = self.reduction
         chunks = (reduction.chunk_tests, reduction.chunk_hits)
@@ -90,6 +90,18 @@ class Traversal:
         self.session.launch(TRAVERSAL, self._kernels[kernel], CHUNKS, *args)
 
 
+def mask_bytes(pairs, arity):
+    """Bytes of the survivor masks of so many pairs: 16 bits per group."""
+    return -(-pairs // group_size(arity)) * 2
+
+
 def pairs_that_fit(memory_limit, arity):
-    """Pairs per stream when two streams and a mask per pair share `memory_limit` bytes."""
-    return memory_limit // (2 * PAIR_BYTES + mask_bytes(arity))
+    """Pairs per stream when two streams and the masks share `memory_limit` bytes."""
+    per_unit = 2 * PAIR_BYTES * UNIT + mask_bytes(UNIT, arity)
+    return memory_limit // per_unit * UNIT
+
+
+def bytes_for(pairs, arity):
+    """The least `memory_limit` with which `pairs_that_fit` is at least `pairs`."""
+    units = -(-pairs // UNIT)
+    return units * (2 * PAIR_BYTES * UNIT + mask_bytes(UNIT, arity))

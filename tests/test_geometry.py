@@ -11,8 +11,12 @@ COUNTS = [1, 2, 15, 16, 17, 31, 33, 1009]
 
 
 def spheres_of(geometry):
-    rows = geometry.spheres.get().transpose(0, 2, 1).reshape(-1, 4).astype(np.float64)
-    return rows[: geometry.num_triangles], rows[geometry.num_triangles :]
+    """The spheres of the triangles and of the padding, float64; both layouts hold the same."""
+    spheres = geometry.spheres.get()
+    rows = geometry.sphere_rows.get().transpose(0, 2, 1).reshape(-1, 4)
+    np.testing.assert_array_equal(spheres, rows)
+    spheres = spheres.astype(np.float64)
+    return spheres[: geometry.num_triangles], spheres[geometry.num_triangles :]
 
 
 @pytest.mark.parametrize("count", COUNTS)
