@@ -20,9 +20,10 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
     return slot < num_slots ? slots[slot] : INVALID;
 }
 
-// Pairs (node, triangle) whose nodes hold `rays_per_node` consecutive slots. Sets the minimum in
-// `closest` or, where that is what is asked, the flag in `blocked`; counts tests and hits per chunk.
-#define DEFINE_INTERSECT_PAIRS(NAME, RESULT, ON_HIT)                                               \
+// Pairs (node, triangle) whose nodes hold `rays_per_node` consecutive slots; a run of pairs shares its
+// rays. Sets the minimum in `result`, or where any hit is asked for, the flag; counts tests and hits
+// per chunk.
+#define DEFINE_INTERSECT_PAIRS(NAME, RESULT, ON_HITS)                                              \
     kernel void NAME(global const uint *restrict length, global const Pair *restrict pairs,        \
                      const uint rays_per_node, const uint num_slots,                               \
                      global const uint *restrict slots, global const float4 *restrict org_tnear,   \
@@ -32,27 +33,45 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
     {                                                                                              \
         const uint n = *length;                                                                    \
         uint tests = 0, hits = 0;                                                                  \
-        for (uint i = chunk_begin(n, 1), end = chunk_end(n, 1); i < end; i++) {                          \
-            const Pair pair = pairs[i];                                                            \
+        for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {                              \
+            const uint count = run_length(pairs, i, end);                                          \
             for (uint k = 0; k < rays_per_node; k++) {                                             \
-                const uint ray = ray_of(pair.x * rays_per_node + k, num_slots, slots);             \
+                const uint ray = ray_of(pairs[i].x * rays_per_node + k, num_slots, slots);         \
                 if (ray == INVALID || dir_tfar[ray].w < org_tnear[ray].w)                          \
                     continue;                                                                      \
                 const RayFrame frame = ray_frame(org_tnear[ray], dir_tfar[ray]);                   \
-                const TriangleHit h                                                                \
-                    = intersect_triangle(&frame, triangles + TRIANGLE_FLOAT4S * (ulong)pair.y);    \
-                tests++;                                                                           \
-                if (h.hit) {                                                                       \
-                    hits++;                                                                        \
-                    ON_HIT;                                                                        \
-                }                                                                                  \
+                uint found = 0;                                                                    \
+                const ulong nearest                                                                \
+                    = intersect_run(&frame, pairs + i, count, triangles, &found);                  \
+                tests += count;                                                                    \
+                hits += found;                                                                     \
+                if (found)                                                                         \
+                    ON_HITS;                                                                       \
             }                                                                                      \
+            i += count;                                                                            \
         }                                                                                          \
         chunk_tests[get_global_id(0)] = tests;                                                     \
         chunk_hits[get_global_id(0)] = hits;                                                       \
     }
 
-DEFINE_INTERSECT_PAIRS(intersect_pairs, ulong, atom_min(result + ray, hit_key(h.t, pair.y)))
+inline ulong intersect_run(const RayFrame *frame, global const Pair *pairs, uint count,
+                           global const float4 *triangles, uint *found)
+{
+    ulong nearest = MISS;
+    for (uint k = 0; k < count; k++) {
+        const uint triangle = pairs[k].y;
+        const TriangleHit h
+            = intersect_triangle(frame, triangles + TRIANGLE_FLOAT4S * (ulong)triangle);
+        if (h.hit) {
+            const ulong key = hit_key(h.t, triangle);
+            nearest = MIN(nearest, key);
+            *found += 1;
+        }
+    }
+    return nearest;
+}
+
+DEFINE_INTERSECT_PAIRS(intersect_pairs, ulong, atom_min(result + ray, nearest))
 DEFINE_INTERSECT_PAIRS(occlude_pairs, uchar, result[ray] = 1)
 
 // One work-item: row `row` of counts grows by the chunks' counts of the final tests.

@@ -7,22 +7,36 @@
 //
 //   FMA(a, b, c), FMA16(a, b, c)   a * b + c, rounded once
 //   MASK16(m)                      bit i: lane i of a comparison's result (0 or -1)
-//   COUNT16(mask)                  number of bits set
-//   COMPRESS16(v, mask)            the lanes whose bit is set, moved to the front, the rest 0; defined
-//                                  only where it is one instruction (AVX-512)
+//   COUNT16(mask), COUNT64(mask)   number of bits set
+//   LOWEST(mask)                   number of the lowest bit set, of a mask that is not 0
+//   COMPRESS16(v, mask)            the lanes whose bit is set, moved to the front, the rest 0
+//   STORE_MASKED(p, v, mask)       lanes whose bit is set to p[lane], the others are left alone
+//                                  (these two are defined where they are one instruction: AVX-512)
+//
+//   EVEN_LANES(a, b), ODD_LANES    a0 a2 .. ae b0 b2 .. be, and a1 a3 .. af b1 b3 .. bf
+//   LOW_PAIRS(a, b), HIGH_PAIRS    a0 b0 a1 b1 .. a7 b7, and a8 b8 .. af bf
+//   TRANSPOSE16(s, x, y, z, w)     sixteen float4 s[] as four float16 rows
+//   CONVERT(T, v)                  lane by lane, as a cast
+//   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
+//   LOAD_WORD(p)                   a ulong of any alignment
 //
 // Build-time constant: PORTABLE, where defined, keeps the x86 built-ins out.
 
 #if defined(POCL_DEVICE_ADDRESS_BITS) && defined(__AVX2__) && defined(__FMA__) && !defined(PORTABLE)
 
+#define X86_BUILTINS
 #define FMA(a, b, c) __builtin_fmaf(a, b, c)
 #define COUNT16(mask) ((uint)__builtin_popcount(mask))
+#define COUNT64(mask) ((uint)__builtin_popcountl(mask))
+#define LOWEST(mask) ((uint)__builtin_ctz(mask))
 
 #ifdef __AVX512DQ__
 #define FMA16(a, b, c) __builtin_ia32_vfmaddps512_mask(a, b, c, (short)-1, 4)
 #define MASK16(m) ((uint)(ushort)__builtin_ia32_cvtd2mask512(m))
 #define COMPRESS16(v, mask)                                                                        \
     as_uint16(__builtin_ia32_compresssi512_mask(as_int16(v), (int16)0, (short)(mask)))
+#define STORE_MASKED(p, v, mask)                                                                   \
+    __builtin_ia32_storedqusi512_mask((int *)(ulong)(p), as_int16(v), (short)(mask))
 #else
 inline float16 FMA16(float16 a, float16 b, float16 c)
 {
@@ -51,12 +65,69 @@ inline uint MASK16(int16 m)
     return (uint)((b.x | b.y) | (b.z | b.w));
 }
 
-inline uint COUNT16(uint mask)
-{
-    mask = mask - ((mask >> 1) & 0x5555u);
-    mask = (mask & 0x3333u) + ((mask >> 2) & 0x3333u);
-    mask = (mask + (mask >> 4)) & 0x0f0fu;
-    return (mask + (mask >> 8)) & 0x1fu;
-}
+#define COUNT16(mask) popcount((uint)(mask))
+#define COUNT64(mask) ((uint)popcount((ulong)(mask)))
+#define LOWEST(mask) (31 - clz((mask) & -(mask)))
+
+#endif
+
+#define EVEN_LANES(a, b) (uint16)((a).even, (b).even)
+#define ODD_LANES(a, b) (uint16)((a).odd, (b).odd)
+
+#ifdef X86_BUILTINS
+
+#define CONVERT(T, v) __builtin_convertvector(v, T)
+#define LOW_PAIRS(a, b)                                                                            \
+    __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
+#define HIGH_PAIRS(a, b)                                                                           \
+    __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31)
+#define LOAD_UNALIGNED(T, p)                                                                       \
+    (((global const struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value)
+#define STORE_UNALIGNED(T, p, v)                                                                   \
+    (((global struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value = (v))
+
+#define LOAD_WORD(p) LOAD_UNALIGNED(ulong, p)
+
+// Within each 128-bit lane, four rows of four become four columns.
+#define LOW_QUADS(a, b)                                                                            \
+    __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29)
+#define HIGH_QUADS(a, b)                                                                           \
+    __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31)
+#define FIRST_HALVES(a, b)                                                                         \
+    __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
+#define SECOND_HALVES(a, b)                                                                        \
+    __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31)
+#define TRANSPOSE16(s, x, y, z, w)                                                                 \
+    {                                                                                              \
+        const float16 r0 = (float16)(s[0], s[4], s[8], s[12]);                                     \
+        const float16 r1 = (float16)(s[1], s[5], s[9], s[13]);                                     \
+        const float16 r2 = (float16)(s[2], s[6], s[10], s[14]);                                    \
+        const float16 r3 = (float16)(s[3], s[7], s[11], s[15]);                                    \
+        const float16 lo01 = LOW_QUADS(r0, r1), hi01 = HIGH_QUADS(r0, r1);                         \
+        const float16 lo23 = LOW_QUADS(r2, r3), hi23 = HIGH_QUADS(r2, r3);                         \
+        x = FIRST_HALVES(lo01, lo23);                                                              \
+        y = SECOND_HALVES(lo01, lo23);                                                             \
+        z = FIRST_HALVES(hi01, hi23);                                                              \
+        w = SECOND_HALVES(hi01, hi23);                                                             \
+    }
+
+#else
+
+#define CONVERT(T, v) CONVERT_(T, v)
+#define CONVERT_(T, v) convert_##T(v)
+#define LOAD_UNALIGNED(T, p) vload16(0, p)
+#define STORE_UNALIGNED(T, p, v) vstore16(v, 0, p)
+#define LOAD_WORD(p) as_ulong(vload8(0, (global const uchar *)(p)))
+
+#define TRANSPOSE16(s, x, y, z, w)                                                                 \
+    {                                                                                              \
+        float rows[4][16] __attribute__((aligned(64)));                                            \
+        for (uint k = 0; k < 16; k++)                                                              \
+            rows[0][k] = s[k].x, rows[1][k] = s[k].y, rows[2][k] = s[k].z, rows[3][k] = s[k].w;    \
+        x = *(float16 *)rows[0];                                                                   \
+        y = *(float16 *)rows[1];                                                                   \
+        z = *(float16 *)rows[2];                                                                   \
+        w = *(float16 *)rows[3];                                                                   \
+    }
 
 #endif

@@ -35,68 +35,79 @@ kernel void scan_chunks(const uint capacity, const ulong in_length,
     level[LEVEL_STREAM] = in_length != 0 ? in_length : *in_stream_length;
 }
 
-#ifdef COMPRESS16
-
-#if ARITY == 4
-#define NODES(p) p->s0000222244446666
-#define TRIANGLES(p) p->s1111333355557777
-#define LANES (uint16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
-typedef uint8 PairGroup;
-#elif ARITY == 8
-#define NODES(p) (uint16)(p->s00000000, p->s22222222)
-#define TRIANGLES(p) (uint16)(p->s11111111, p->s33333333)
-#define LANES (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7)
-typedef uint4 PairGroup;
-#else
-#define NODES(p) (uint16)(p->x)
-#define TRIANGLES(p) (uint16)(p->y)
-#define LANES (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-typedef uint2 PairGroup;
-#endif
-
-// The surviving children of a group to out[0 ..], and whatever to the rest of sixteen places.
-inline void write_group(global const PairGroup *group, uint mask, global uint16 *out)
+// Triangles of sixteen pairs whose bit is set in `mask`, with their new node, to out[0 ..].
+inline void write_survivors(global const Pair *pairs, uint node, uint mask, global Pair *out)
 {
-    const uint16 n = COMPRESS16(NODES(group) * ARITY + LANES, mask);
-    const uint16 t = COMPRESS16(TRIANGLES(group), mask);
-    typedef uint16 Unaligned __attribute__((aligned(8)));
-    global Unaligned *to = (global Unaligned *)out;
-    to[0] = (uint16)(n.s0, t.s0, n.s1, t.s1, n.s2, t.s2, n.s3, t.s3, n.s4, t.s4, n.s5, t.s5, n.s6,
-                     t.s6, n.s7, t.s7);
-    if (COUNT16(mask) > 8)
-        to[1] = (uint16)(n.s8, t.s8, n.s9, t.s9, n.sa, t.sa, n.sb, t.sb, n.sc, t.sc, n.sd, t.sd,
-                         n.se, t.se, n.sf, t.sf);
+#ifdef COMPRESS16
+    const uint16 a = LOAD_UNALIGNED(uint16, (global const uint *)pairs);
+    const uint16 b = LOAD_UNALIGNED(uint16, (global const uint *)(pairs + WIDTH / 2));
+    const uint16 t = COMPRESS16(ODD_LANES(a, b), mask), n = (uint16)(node);
+    // Two words a survivor: neither more nor less may be written, other survivors stand behind.
+    const ulong words = (1ul << 2 * COUNT16(mask)) - 1;
+    STORE_MASKED(out, LOW_PAIRS(n, t), words);
+    if (words >> 16)
+        STORE_MASKED(out + WIDTH / 2, HIGH_PAIRS(n, t), words >> 16);
+#else
+    for (uint k = 0; mask != 0; k++, mask >>= 1) {
+        if (mask & 1u)
+            *out++ = (Pair)(node, pairs[k].y);
+    }
+#endif
 }
 
+#define MASKS_PER_ULONG (sizeof(ulong) / sizeof(Mask))
+#if ARITY > 8
+#define FIRST_CHILDREN 0x0001000100010001ul
+#else
+#define FIRST_CHILDREN 0x0101010101010101ul
 #endif
 
-// Survivor (member k, child) of a group becomes (node of k * ARITY + child, triangle of k).
+// Where each child's survivors of a run begin; returns where the last child's end.
+inline uint place_children(global const Mask *masks, uint count, uint next, uint *places)
+{
+    uint sums[ARITY] = {0};
+    uint k = 0;
+    for (; k + MASKS_PER_ULONG <= count; k += MASKS_PER_ULONG) {
+        const ulong several = LOAD_WORD(masks + k);
+        for (uint child = 0; child < ARITY; child++)
+            sums[child] += COUNT64((several >> child) & FIRST_CHILDREN);
+    }
+    for (; k < count; k++) {
+        for (uint child = 0; child < ARITY; child++)
+            sums[child] += (masks[k] >> child) & 1;
+    }
+    for (uint child = 0; child < ARITY; child++) {
+        places[child] = next;
+        next += sums[child];
+    }
+    return next;
+}
+
+// Survivors of a run, child by child: (node, triangle) with bit c becomes (node * ARITY + c, triangle).
 kernel void scatter_children(global const uint *restrict in_length, global const Pair *restrict in,
-                             global const ushort *restrict masks,
+                             global const Mask *restrict masks,
                              global const uint *restrict offsets,
-                             global const uint *restrict chunk_hits,
                              global const uint *restrict out_length, global Pair *restrict out)
 {
     if (*out_length == 0)
         return;
     const uint n = *in_length;
     uint next = offsets[get_global_id(0)];
-    const uint stop = next + chunk_hits[get_global_id(0)];
-    for (uint i = chunk_begin(n, GROUP), end = chunk_end(n, GROUP); i < end; i += GROUP) {
-        uint mask = masks[i / GROUP];
-#ifdef COMPRESS16
-        // Sixteen places are written, so near the next chunk's survivors it goes one by one.
-        if (next + 16 <= stop) {
-            write_group((global const PairGroup *)(in + i), mask, (global uint16 *)(out + next));
-            next += COUNT16(mask);
-            continue;
-        }
-#endif
-        for (uint bit = 0; mask != 0; bit++, mask >>= 1) {
-            if (mask & 1u) {
-                const Pair pair = in[i + bit / ARITY];
-                out[next++] = (Pair)(pair.x * ARITY + bit % ARITY, pair.y);
+    for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {
+        const uint count = run_length(in, i, end), first_child = in[i].x * ARITY;
+        uint places[ARITY];
+        next = place_children(masks + i, count, next, places);
+        for (uint k = i; k < i + count; k += WIDTH) {
+            const int16 lanes = CONVERT(int16, LOAD_UNALIGNED(Mask16, masks + k));
+            const uint left = i + count - k, here = left < WIDTH ? (1u << left) - 1 : 0xffffu;
+            for (uint child = 0; child < ARITY; child++) {
+                const uint mask = MASK16((lanes << (31 - child)) >> 31) & here;
+                if (mask) {
+                    write_survivors(in + k, first_child + child, mask, out + places[child]);
+                    places[child] += COUNT16(mask);
+                }
             }
         }
+        i += count;
     }
 }

@@ -4,15 +4,24 @@
 // which takes one contiguous chunk of the stream. So nothing is read back between stages, and the
 // order of a stream never depends on timing.
 //
-// A pass handles GROUP pairs at a time, whose GROUP * ARITY children fill sixteen lanes; chunks are
-// whole groups. Survivors of a pass are a 16-bit mask per group: bit GROUP-member * ARITY + child.
+// Streams are sorted by node as far as it matters for speed: within a chunk, pairs of one node stand
+// together, a *run*. A run shares its node, so a pass works on one node and up to sixteen triangles at
+// a time. Survivors of a pass are a mask per pair: bit c for child c.
 //
 // Build-time constants: CHUNKS, ARITY.
 
 #include "common.h"
 
 typedef uint2 Pair; // x: node, y: triangle
-#define GROUP (16 / ARITY)
+#define WIDTH 16
+
+#if ARITY > 8
+typedef ushort Mask;
+typedef ushort16 Mask16;
+#else
+typedef uchar Mask;
+typedef uchar16 Mask16;
+#endif
 
 // Counts of one level, added to by `scan_chunks`.
 #define LEVEL_TESTS 0
@@ -20,15 +29,21 @@ typedef uint2 Pair; // x: node, y: triangle
 #define LEVEL_STREAM 2 // length of the level's input stream
 #define LEVEL_COUNTS 3
 
-// Chunk of this work-item in a stream of n elements taken `unit` at a time: first and last + 1.
-inline ulong chunk_begin(ulong n, uint unit)
-{
-    const ulong length = (n + (ulong)CHUNKS * unit - 1) / ((ulong)CHUNKS * unit) * unit;
-    return MIN(get_global_id(0) * length, n);
-}
+// Chunk of this work-item in a stream of n elements: first, and last + 1.
+inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
 
-inline ulong chunk_end(ulong n, uint unit)
+inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
+
+// Length of the run that begins at `first`. Reads up to WIDTH pairs more than `end`.
+inline uint run_length(global const Pair *pairs, uint first, uint end)
 {
-    const ulong length = (n + (ulong)CHUNKS * unit - 1) / ((ulong)CHUNKS * unit) * unit;
-    return MIN((get_global_id(0) + 1) * length, n);
+    const uint node = pairs[first].x;
+    for (uint i = first; i < end; i += WIDTH) {
+        const uint16 a = LOAD_UNALIGNED(uint16, (global const uint *)(pairs + i));
+        const uint16 b = LOAD_UNALIGNED(uint16, (global const uint *)(pairs + i + WIDTH / 2));
+        const uint others = ~MASK16(EVEN_LANES(a, b) == node) & 0xffffu;
+        if (others)
+            return MIN(i + LOWEST(others), end) - first;
+    }
+    return end - first;
 }

@@ -43,7 +43,7 @@ kernel void count_top(const uint num_nodes, const uint first_triangle, const uin
     const uint runs = (last_triangle - first_triangle + RUN - 1) / RUN;
     const ulong tasks = (ulong)num_nodes * runs;
     uint tests = 0, hits = 0;
-    for (ulong task = chunk_begin(tasks, 1), end = chunk_end(tasks, 1); task < end; task++) {
+    for (ulong task = chunk_begin(tasks), end = chunk_end(tasks); task < end; task++) {
         const uint node = task / runs;
         const uint begin = first_triangle + (task % runs) * RUN;
         const uint stop = MIN(begin + RUN, last_triangle);
@@ -67,7 +67,7 @@ kernel void write_top(const uint num_nodes, const uint first_triangle, const uin
     const uint runs = (last_triangle - first_triangle + RUN - 1) / RUN;
     const ulong tasks = (ulong)num_nodes * runs;
     uint next = offsets[get_global_id(0)];
-    for (ulong task = chunk_begin(tasks, 1), end = chunk_end(tasks, 1); task < end; task++) {
+    for (ulong task = chunk_begin(tasks), end = chunk_end(tasks); task < end; task++) {
         const uint node = task / runs;
         const uint begin = first_triangle + (task % runs) * RUN;
         const uint stop = MIN(begin + RUN, last_triangle);
@@ -85,61 +85,65 @@ kernel void write_top(const uint num_nodes, const uint first_triangle, const uin
 
 // --- every level below ---------------------------------------------------------------------------
 
-// A group's children side by side: field `row` of the nodes' blocks, and the triangles' spheres, each
-// component spread over its member's lanes.
-#if ARITY == 4
-#define GROUP_ROW(row) ((float16)(c[0][row], c[1][row], c[2][row], c[3][row]))
-#define GROUP_SPHERES (float16)(d[0], d[1], d[2], d[3])
-#define SPHERES_TYPE float16
-#define SPREAD(s, x, y, z, w) s.s##x##x##x##x##y##y##y##y##z##z##z##z##w##w##w##w
-#define SPREAD_X(s) SPREAD(s, 0, 4, 8, c)
-#define SPREAD_Y(s) SPREAD(s, 1, 5, 9, d)
-#define SPREAD_Z(s) SPREAD(s, 2, 6, a, e)
-#define SPREAD_R(s) SPREAD(s, 3, 7, b, f)
-#elif ARITY == 8
-#define GROUP_ROW(row) ((float16)(c[0][row], c[1][row]))
-#define GROUP_SPHERES (float8)(d[0], d[1])
-#define SPHERES_TYPE float8
-#define SPREAD_X(s) ((float16)(s.s00000000, s.s44444444))
-#define SPREAD_Y(s) ((float16)(s.s11111111, s.s55555555))
-#define SPREAD_Z(s) ((float16)(s.s22222222, s.s66666666))
-#define SPREAD_R(s) ((float16)(s.s33333333, s.s77777777))
-#else
-#define GROUP_ROW(row) (c[0][row])
-#define GROUP_SPHERES d[0]
-#define SPHERES_TYPE float4
-#define SPREAD_X(s) (float16)(s.x)
-#define SPREAD_Y(s) (float16)(s.y)
-#define SPREAD_Z(s) (float16)(s.z)
-#define SPREAD_R(s) (float16)(s.w)
-#endif
+// The spheres of the triangles of up to sixteen pairs as rows; the last pair fills up.
+typedef struct {
+    float16 x, y, z, d;
+} SphereRows;
+
+inline SphereRows gather_spheres(global const Pair *pairs, uint count,
+                                 global const float4 *spheres)
+{
+    float4 s[WIDTH] __attribute__((aligned(64)));
+    for (uint k = 0; k < WIDTH; k++)
+        s[k] = spheres[pairs[k < count ? k : count - 1].y];
+    SphereRows rows;
+    TRANSPOSE16(s, rows.x, rows.y, rows.z, rows.d);
+    return rows;
+}
+
+inline int16 test_child(global const float *block, uint child, const SphereRows *p)
+{
+    global const float *f = block + child;
+    return node_meets_sphere(f[0], f[ARITY], f[2 * ARITY], f[3 * ARITY], f[4 * ARITY], f[5 * ARITY],
+                             f[6 * ARITY], f[7 * ARITY], f[8 * ARITY], f[9 * ARITY], p->x, p->y,
+                             p->z, p->d);
+}
+
+inline void store_masks(global Mask *masks, Mask16 values, uint count)
+{
+    if (count == WIDTH) {
+        STORE_UNALIGNED(Mask16, masks, values);
+        return;
+    }
+    Mask lanes[WIDTH] __attribute__((aligned(64)));
+    *(Mask16 *)lanes = values;
+    for (uint k = 0; k < count; k++) // not more: the next chunk's masks follow
+        masks[k] = lanes[k];
+}
 
 // `valid[node]`: children of the node that are not null, the tests that a pair costs.
 kernel void test_children(global const uint *restrict length, global const Pair *restrict pairs,
                           global const float *restrict blocks, global const uint *restrict valid,
-                          global const float4 *restrict spheres, global ushort *restrict masks,
+                          global const float4 *restrict spheres, global Mask *restrict masks,
                           global uint *restrict chunk_tests, global uint *restrict chunk_hits)
 {
     const uint n = *length;
     uint tests = 0, hits = 0;
-    for (uint i = chunk_begin(n, GROUP), end = chunk_end(n, GROUP); i < end; i += GROUP) {
-        global const FLOATN *c[GROUP];
-        float4 d[GROUP];
-        for (uint k = 0; k < GROUP; k++) {
-            const Pair pair = pairs[MIN(i + k, n - 1)];
-            c[k] = (global const FLOATN *)(blocks + (ulong)pair.x * (NODE_ROWS * ARITY));
-            d[k] = spheres[pair.y];
-            tests += i + k < n ? valid[pair.x] : 0;
+    for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {
+        const uint node = pairs[i].x;
+        const uint count = run_length(pairs, i, MIN(i + WIDTH, end));
+        const uint lanes = (1u << count) - 1;
+        const SphereRows rows = gather_spheres(pairs + i, count, spheres);
+        global const float *block = blocks + (ulong)node * (NODE_ROWS * ARITY);
+        int16 mask = 0;
+        for (uint child = 0; child < ARITY; child++) {
+            const int16 hit = test_child(block, child, &rows);
+            mask |= hit & (1 << child);
+            hits += COUNT16(MASK16(hit) & lanes);
         }
-        const SPHERES_TYPE s = GROUP_SPHERES;
-        uint mask = MASK16(node_meets_sphere(
-            GROUP_ROW(0), GROUP_ROW(1), GROUP_ROW(2), GROUP_ROW(3), GROUP_ROW(4), GROUP_ROW(5),
-            GROUP_ROW(6), GROUP_ROW(7), GROUP_ROW(8), GROUP_ROW(9), SPREAD_X(s), SPREAD_Y(s), SPREAD_Z(s),
-            SPREAD_R(s)));
-        if (n - i < GROUP)
-            mask &= (1u << (n - i) * ARITY) - 1;
-        masks[i / GROUP] = (ushort)mask;
-        hits += COUNT16(mask);
+        store_masks(masks + i, CONVERT(Mask16, mask), count);
+        tests += count * valid[node];
+        i += count;
     }
     chunk_tests[get_global_id(0)] = tests;
     chunk_hits[get_global_id(0)] = hits;

@@ -16,7 +16,7 @@ from raystream.errors import MemoryLimitError
 from raystream.hierarchy import ARITIES, RayHierarchy, leaf_slots
 from raystream.statistics import Statistics
 from raystream.stream import PAIR_BYTES
-from raystream.traverse import UNIT, Traversal, bytes_for, mask_bytes, pairs_that_fit
+from raystream.traverse import Traversal, bytes_per_pair
 
 REDUCTIONS = ("segmented",)
 _FIRST_PAIRS = 1 << 20  # streams start with room for this many pairs and grow up to the limit
@@ -55,8 +55,8 @@ class RayspaceTracer:
         self.session, self.geometry = session, geometry
         self._arity, self._levels, self._limit = arity, levels, memory_limit
         self._most_pairs = min(
-            pairs_that_fit(memory_limit, arity),
-            session.device.max_mem_alloc_size // (PAIR_BYTES * UNIT) * UNIT,
+            memory_limit // bytes_per_pair(arity),
+            session.device.max_mem_alloc_size // PAIR_BYTES - 16,
         )
         self._capacity = min(_FIRST_PAIRS, self._most_pairs)
 
@@ -92,7 +92,7 @@ class RayspaceTracer:
     def _check_room(self, hierarchy):
         """A batch of one triangle must fit: at most one pair per leaf."""
         if hierarchy.num_nodes[0] > self._most_pairs:
-            need = bytes_for(hierarchy.num_nodes[0], self._arity)
+            need = hierarchy.num_nodes[0] * bytes_per_pair(self._arity)
             raise MemoryLimitError(
                 f"memory_limit: {hierarchy.num_nodes[0]} rays need at least {need} bytes, "
                 f"got {self._limit} (at most {self._most_pairs} pairs per stream on this device)"
@@ -119,8 +119,7 @@ class RayspaceTracer:
     def _cut(self, first, last, survivors):
         """The batches that replace one that overflowed; the streams grow first, up to the limit."""
         if self._capacity < self._most_pairs:
-            wanted = max(2 * self._capacity, -(-2 * survivors // UNIT) * UNIT)
-            self._capacity = min(wanted, self._most_pairs)
+            self._capacity = min(max(2 * self._capacity, 2 * survivors), self._most_pairs)
             return [(first, last)]
         # `_check_room` made sure that a batch of one triangle never comes here.
         pieces = max(2, -(-2 * survivors // self._capacity))
@@ -132,7 +131,7 @@ class RayspaceTracer:
         inputs = [0, *(int(n) for n in counts[1:, 2])]
         following = [*inputs[1:], 0]
         return max(
-            PAIR_BYTES * (a + b) + mask_bytes(a, self._arity)
+            (bytes_per_pair(self._arity) - PAIR_BYTES) * a + PAIR_BYTES * b
             for a, b in zip(inputs, following, strict=True)
         )
 

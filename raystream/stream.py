@@ -10,6 +10,7 @@ from raystream.statistics import STREAM_REDUCTION
 # Work-items per stream launch: enough to balance the cores, few enough to scan serially.
 CHUNKS = 512
 PAIR_BYTES = 8
+_LOADED = 16  # kernels load sixteen pairs at a time: so many more must be there to read
 
 
 @dataclasses.dataclass
@@ -18,7 +19,7 @@ class PairStream:
 
     Attributes
     ----------
-    pairs : Array of shape (capacity, 2) uint32
+    pairs : Array of shape (capacity + 16, 2) uint32
     length : Array of shape (1,) uint32
         Only the first `length` pairs mean anything.
     """
@@ -29,12 +30,18 @@ class PairStream:
     @classmethod
     def empty(cls, session, capacity):
         """An uninitialised stream of room for `capacity` pairs."""
-        return cls(session.empty((capacity, 2), np.uint32), session.empty(1, np.uint32))
+        pairs = session.empty((capacity + _LOADED, 2), np.uint32)
+        return cls(pairs, session.empty(1, np.uint32))
+
+    @property
+    def capacity(self):
+        """Pairs that it can hold."""
+        return self.pairs.shape[0] - _LOADED
 
 
-def group_size(arity):
-    """Pairs that one pass handles at a time: their children fill sixteen lanes (cl/stream.h)."""
-    return 16 // arity
+def mask_type(arity):
+    """Type of one pair's survivor mask: a bit per child."""
+    return np.uint16 if arity > 8 else np.uint8
 
 
 class Reduction:
@@ -75,7 +82,7 @@ class Reduction:
             STREAM_REDUCTION,
             self._kernels["scan_chunks"],
             1,
-            np.uint32(target.pairs.shape[0]),
+            np.uint32(target.capacity),
             np.uint64(tasks),
             target.length if source is None else source.length,
             self.chunk_tests,
@@ -97,7 +104,6 @@ class Reduction:
             source.pairs,
             masks,
             self.offsets,
-            self.chunk_hits,
             target.length,
             target.pairs,
         )

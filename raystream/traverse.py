@@ -3,9 +3,9 @@
 import numpy as np
 
 from raystream.statistics import TRAVERSAL
-from raystream.stream import CHUNKS, PAIR_BYTES, PairStream, Reduction, group_size
+from raystream.stream import CHUNKS, PAIR_BYTES, PairStream, Reduction, mask_type
 
-UNIT = 16  # streams hold whole groups, whatever the arity
+UNIT = 16  # pairs that a kernel loads at a time
 COUNTS = 3  # tests, hits, stream length of a level: cl/stream.h
 
 
@@ -18,7 +18,7 @@ class Traversal:
     geometry : raystream.geometry.Geometry
     hierarchy : raystream.hierarchy.RayHierarchy
     capacity : int
-        Pairs that one stream can hold, a multiple of `UNIT`.
+        Pairs that one stream can hold.
     test_rays : bool
         Whether the rays themselves (level 0) are tested against the triangles' spheres, as in the
         ray-space hierarchy's paper, or the pairs of level 1 are handed on.
@@ -38,7 +38,8 @@ class Traversal:
         self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)
         session.fill(TRAVERSAL, self.counts, 0)
         self._streams = [PairStream.empty(session, capacity) for _ in range(2)]
-        self._masks = session.empty(capacity // group_size(hierarchy.arity), np.uint16)
+        # Kernels load sixteen masks and pairs at a time; what lies behind the last is not used.
+        self._masks = session.empty(capacity + UNIT, mask_type(hierarchy.arity))
 
     @property
     def rays_per_node(self):
@@ -90,18 +91,6 @@ class Traversal:
         self.session.launch(TRAVERSAL, self._kernels[kernel], CHUNKS, *args)
 
 
-def mask_bytes(pairs, arity):
-    """Bytes of the survivor masks of so many pairs: 16 bits per group."""
-    return -(-pairs // group_size(arity)) * 2
-
-
-def pairs_that_fit(memory_limit, arity):
-    """Pairs per stream when two streams and the masks share `memory_limit` bytes."""
-    per_unit = 2 * PAIR_BYTES * UNIT + mask_bytes(UNIT, arity)
-    return memory_limit // per_unit * UNIT
-
-
-def bytes_for(pairs, arity):
-    """The least `memory_limit` with which `pairs_that_fit` is at least `pairs`."""
-    units = -(-pairs // UNIT)
-    return units * (2 * PAIR_BYTES * UNIT + mask_bytes(UNIT, arity))
+def bytes_per_pair(arity):
+    """What a pair of capacity costs: its place in two streams and its mask."""
+    return 2 * PAIR_BYTES + np.dtype(mask_type(arity)).itemsize

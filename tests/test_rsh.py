@@ -154,7 +154,7 @@ def test_streams_grow_before_batches_are_cut(rng, monkeypatch):
 
 def test_too_little_memory_is_one_clear_error(rng):
     tracer = rs.Tracer(triangle_soup(rng, 50), "rsh", memory_limit=1000)
-    with pytest.raises(MemoryLimitError, match="memory_limit: 500 rays need at least 8448 bytes"):
+    with pytest.raises(MemoryLimitError, match="memory_limit: 500 rays need at least 8500 bytes"):
         tracer.intersect(*random_rays(rng, 500))
 
 
