@@ -17,7 +17,7 @@
 // and the watertight test's own perturbation, below 4 u |w|) is covered by adding
 // SLACK * (|wx| + |wy| + |wz|), SLACK = 32 u, to s.
 //
-// Build-time constant: ARITY (4, 8 or 16).
+// Build-time constant: ARITY (4 or 8).
 
 #include "common.h"
 

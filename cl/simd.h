@@ -13,12 +13,12 @@
 //   STORE_MASKED(p, v, mask)       lanes whose bit is set to p[lane], the others are left alone
 //                                  (these two are defined where they are one instruction: AVX-512)
 //
+//   TEST64(p, bit)                 bit i: whether byte i of the 64 at p has that bit set
 //   EVEN_LANES(a, b), ODD_LANES    a0 a2 .. ae b0 b2 .. be, and a1 a3 .. af b1 b3 .. bf
 //   LOW_PAIRS(a, b), HIGH_PAIRS    a0 b0 a1 b1 .. a7 b7, and a8 b8 .. af bf
 //   TRANSPOSE16(s, x, y, z, w)     sixteen float4 s[] as four float16 rows
 //   CONVERT(T, v)                  lane by lane, as a cast
 //   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
-//   LOAD_WORD(p)                   a ulong of any alignment
 //
 // Build-time constant: PORTABLE, where defined, keeps the x86 built-ins out.
 
@@ -37,6 +37,17 @@
     as_uint16(__builtin_ia32_compresssi512_mask(as_int16(v), (int16)0, (short)(mask)))
 #define STORE_MASKED(p, v, mask)                                                                   \
     __builtin_ia32_storedqusi512_mask((int *)(ulong)(p), as_int16(v), (short)(mask))
+typedef char Bytes64 __attribute__((vector_size(64)));
+inline ulong TEST64(global const uchar *p, uint bit)
+{
+    typedef Bytes64 Unaligned __attribute__((aligned(1)));
+    const char b = (char)(1 << bit);
+    const Bytes64 bits = {b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b,
+                          b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b,
+                          b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b};
+    return __builtin_ia32_cvtb2mask512(*(global const Unaligned *)p << (7 - bit));
+}
+#define HAS_TEST64
 #else
 inline float16 FMA16(float16 a, float16 b, float16 c)
 {
@@ -74,6 +85,19 @@ inline uint MASK16(int16 m)
 #define EVEN_LANES(a, b) (uint16)((a).even, (b).even)
 #define ODD_LANES(a, b) (uint16)((a).odd, (b).odd)
 
+#ifndef HAS_TEST64
+inline ulong TEST64(global const uchar *p, uint bit)
+{
+    ulong mask = 0;
+    for (uint k = 0; k < 8; k++) {
+        const ulong bytes = (as_ulong(vload8(k, p)) >> bit) & 0x0101010101010101ul;
+        // The product gathers the lowest bits of eight bytes in its top byte.
+        mask |= ((bytes * 0x0102040810204080ul) >> 56) << (8 * k);
+    }
+    return mask;
+}
+#endif
+
 #ifdef X86_BUILTINS
 
 #define CONVERT(T, v) __builtin_convertvector(v, T)
@@ -85,8 +109,6 @@ inline uint MASK16(int16 m)
     (((global const struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value)
 #define STORE_UNALIGNED(T, p, v)                                                                   \
     (((global struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value = (v))
-
-#define LOAD_WORD(p) LOAD_UNALIGNED(ulong, p)
 
 // Within each 128-bit lane, four rows of four become four columns.
 #define LOW_QUADS(a, b)                                                                            \
@@ -117,17 +139,16 @@ inline uint MASK16(int16 m)
 #define CONVERT_(T, v) convert_##T(v)
 #define LOAD_UNALIGNED(T, p) vload16(0, p)
 #define STORE_UNALIGNED(T, p, v) vstore16(v, 0, p)
-#define LOAD_WORD(p) as_ulong(vload8(0, (global const uchar *)(p)))
 
-#define TRANSPOSE16(s, x, y, z, w)                                                                 \
+#define TRANSPOSE16(s, to_x, to_y, to_z, to_w)                                                     \
     {                                                                                              \
-        float rows[4][16] __attribute__((aligned(64)));                                            \
+        float lane[4][16] __attribute__((aligned(64)));                                            \
         for (uint k = 0; k < 16; k++)                                                              \
-            rows[0][k] = s[k].x, rows[1][k] = s[k].y, rows[2][k] = s[k].z, rows[3][k] = s[k].w;    \
-        x = *(float16 *)rows[0];                                                                   \
-        y = *(float16 *)rows[1];                                                                   \
-        z = *(float16 *)rows[2];                                                                   \
-        w = *(float16 *)rows[3];                                                                   \
+            lane[0][k] = s[k].x, lane[1][k] = s[k].y, lane[2][k] = s[k].z, lane[3][k] = s[k].w;    \
+        to_x = *(float16 *)lane[0];                                                                \
+        to_y = *(float16 *)lane[1];                                                                \
+        to_z = *(float16 *)lane[2];                                                                \
+        to_w = *(float16 *)lane[3];                                                                \
     }
 
 #endif

@@ -35,18 +35,17 @@ kernel void scan_chunks(const uint capacity, const ulong in_length,
     level[LEVEL_STREAM] = in_length != 0 ? in_length : *in_stream_length;
 }
 
-// Triangles of sixteen pairs whose bit is set in `mask`, with their new node, to out[0 ..].
-inline void write_survivors(global const Pair *pairs, uint node, uint mask, global Pair *out)
+// Of sixteen pairs with triangles `t` those whose bit is set in `mask`, with their new node.
+inline void write_survivors(global const Pair *pairs, uint16 t, uint node, uint mask,
+                            global Pair *out)
 {
 #ifdef COMPRESS16
-    const uint16 a = LOAD_UNALIGNED(uint16, (global const uint *)pairs);
-    const uint16 b = LOAD_UNALIGNED(uint16, (global const uint *)(pairs + WIDTH / 2));
-    const uint16 t = COMPRESS16(ODD_LANES(a, b), mask), n = (uint16)(node);
+    const uint16 kept = COMPRESS16(t, mask), n = (uint16)(node);
     // Two words a survivor: neither more nor less may be written, other survivors stand behind.
     const ulong words = (1ul << 2 * COUNT16(mask)) - 1;
-    STORE_MASKED(out, LOW_PAIRS(n, t), words);
-    if (words >> 16)
-        STORE_MASKED(out + WIDTH / 2, HIGH_PAIRS(n, t), words >> 16);
+    STORE_MASKED(out, LOW_PAIRS(n, kept), words);
+    if (words >> WIDTH)
+        STORE_MASKED(out + WIDTH / 2, HIGH_PAIRS(n, kept), words >> WIDTH);
 #else
     for (uint k = 0; mask != 0; k++, mask >>= 1) {
         if (mask & 1u)
@@ -55,26 +54,16 @@ inline void write_survivors(global const Pair *pairs, uint node, uint mask, glob
 #endif
 }
 
-#define MASKS_PER_ULONG (sizeof(ulong) / sizeof(Mask))
-#if ARITY > 8
-#define FIRST_CHILDREN 0x0001000100010001ul
-#else
-#define FIRST_CHILDREN 0x0101010101010101ul
-#endif
+inline ulong first_bits(uint count) { return count < 64 ? (1ul << count) - 1 : ~0ul; }
 
 // Where each child's survivors of a run begin; returns where the last child's end.
 inline uint place_children(global const Mask *masks, uint count, uint next, uint *places)
 {
     uint sums[ARITY] = {0};
-    uint k = 0;
-    for (; k + MASKS_PER_ULONG <= count; k += MASKS_PER_ULONG) {
-        const ulong several = LOAD_WORD(masks + k);
+    for (uint k = 0; k < count; k += 64) {
+        const ulong here = first_bits(count - k);
         for (uint child = 0; child < ARITY; child++)
-            sums[child] += COUNT64((several >> child) & FIRST_CHILDREN);
-    }
-    for (; k < count; k++) {
-        for (uint child = 0; child < ARITY; child++)
-            sums[child] += (masks[k] >> child) & 1;
+            sums[child] += COUNT64(TEST64(masks + k, child) & here);
     }
     for (uint child = 0; child < ARITY; child++) {
         places[child] = next;
@@ -83,7 +72,27 @@ inline uint place_children(global const Mask *masks, uint count, uint next, uint
     return next;
 }
 
-// Survivors of a run, child by child: (node, triangle) with bit c becomes (node * ARITY + c, triangle).
+// Survivors of up to 64 pairs of a run, to their children's places, which move on.
+inline void write_block(global const Pair *pairs, global const Mask *masks, uint count,
+                        uint first_child, uint *places, global Pair *out)
+{
+    ulong kept[ARITY];
+    for (uint child = 0; child < ARITY; child++)
+        kept[child] = TEST64(masks, child) & first_bits(count);
+    for (uint k = 0; k < count; k += WIDTH, pairs += WIDTH) {
+        const uint16 t = TRIANGLES_OF(pairs);
+        for (uint child = 0; child < ARITY; child++) {
+            const uint mask = (uint)(kept[child] >> k) & 0xffffu;
+            if (mask) {
+                write_survivors(pairs, t, first_child + child, mask, out + places[child]);
+                places[child] += COUNT16(mask);
+            }
+        }
+    }
+}
+
+// Survivors of a run, child by child: (node, triangle) with bit c becomes
+// (node * ARITY + c, triangle), so that each child's pairs are a run again.
 kernel void scatter_children(global const uint *restrict in_length, global const Pair *restrict in,
                              global const Mask *restrict masks,
                              global const uint *restrict offsets,
@@ -94,20 +103,12 @@ kernel void scatter_children(global const uint *restrict in_length, global const
     const uint n = *in_length;
     uint next = offsets[get_global_id(0)];
     for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {
-        const uint count = run_length(in, i, end), first_child = in[i].x * ARITY;
+        const uint count = run_length(in, i, end);
         uint places[ARITY];
         next = place_children(masks + i, count, next, places);
-        for (uint k = i; k < i + count; k += WIDTH) {
-            const int16 lanes = CONVERT(int16, LOAD_UNALIGNED(Mask16, masks + k));
-            const uint left = i + count - k, here = left < WIDTH ? (1u << left) - 1 : 0xffffu;
-            for (uint child = 0; child < ARITY; child++) {
-                const uint mask = MASK16((lanes << (31 - child)) >> 31) & here;
-                if (mask) {
-                    write_survivors(in + k, first_child + child, mask, out + places[child]);
-                    places[child] += COUNT16(mask);
-                }
-            }
-        }
+        for (uint k = 0; k < count; k += 64)
+            write_block(in + i + k, masks + i + k, MIN(count - k, 64u), in[i].x * ARITY, places,
+                        out);
         i += count;
     }
 }

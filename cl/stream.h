@@ -15,13 +15,7 @@
 typedef uint2 Pair; // x: node, y: triangle
 #define WIDTH 16
 
-#if ARITY > 8
-typedef ushort Mask;
-typedef ushort16 Mask16;
-#else
 typedef uchar Mask;
-typedef uchar16 Mask16;
-#endif
 
 // Counts of one level, added to by `scan_chunks`.
 #define LEVEL_TESTS 0
@@ -34,14 +28,19 @@ inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
 
 inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
 
+#define NODES_OF(pairs)                                                                            \
+    EVEN_LANES(LOAD_UNALIGNED(uint16, (global const uint *)(pairs)),                               \
+               LOAD_UNALIGNED(uint16, (global const uint *)((pairs) + WIDTH / 2)))
+#define TRIANGLES_OF(pairs)                                                                        \
+    ODD_LANES(LOAD_UNALIGNED(uint16, (global const uint *)(pairs)),                                \
+              LOAD_UNALIGNED(uint16, (global const uint *)((pairs) + WIDTH / 2)))
+
 // Length of the run that begins at `first`. Reads up to WIDTH pairs more than `end`.
 inline uint run_length(global const Pair *pairs, uint first, uint end)
 {
     const uint node = pairs[first].x;
     for (uint i = first; i < end; i += WIDTH) {
-        const uint16 a = LOAD_UNALIGNED(uint16, (global const uint *)(pairs + i));
-        const uint16 b = LOAD_UNALIGNED(uint16, (global const uint *)(pairs + i + WIDTH / 2));
-        const uint others = ~MASK16(EVEN_LANES(a, b) == node) & 0xffffu;
+        const uint others = ~MASK16(NODES_OF(pairs + i) == node) & 0xffffu;
         if (others)
             return MIN(i + LOWEST(others), end) - first;
     }

@@ -109,14 +109,14 @@ inline int16 test_child(global const float *block, uint child, const SphereRows 
                              p->z, p->d);
 }
 
-inline void store_masks(global Mask *masks, Mask16 values, uint count)
+inline void store_masks(global Mask *masks, uchar16 values, uint count)
 {
     if (count == WIDTH) {
-        STORE_UNALIGNED(Mask16, masks, values);
+        STORE_UNALIGNED(uchar16, masks, values);
         return;
     }
     Mask lanes[WIDTH] __attribute__((aligned(64)));
-    *(Mask16 *)lanes = values;
+    *(uchar16 *)lanes = values;
     for (uint k = 0; k < count; k++) // not more: the next chunk's masks follow
         masks[k] = lanes[k];
 }
@@ -141,7 +141,7 @@ kernel void test_children(global const uint *restrict length, global const Pair 
             mask |= hit & (1 << child);
             hits += COUNT16(MASK16(hit) & lanes);
         }
-        store_masks(masks + i, CONVERT(Mask16, mask), count);
+        store_masks(masks + i, CONVERT(uchar16, mask), count);
         tests += count * valid[node];
         i += count;
     }

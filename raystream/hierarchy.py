@@ -8,7 +8,7 @@ from raystream import device
 from raystream.checks import check_choice, check_count
 from raystream.statistics import HIERARCHY_CREATION
 
-ARITIES = (4, 8, 16)
+ARITIES = (4, 8)
 NODE_ROWS = 10  # cl/node.h
 _INVALID = np.uint32(0xFFFFFFFF)
 _TILE = 8
@@ -101,7 +101,7 @@ class RayHierarchy:
         rays : raystream.rays.Rays
             On the device. With a `size` the leaves follow the screen (`screen_slots`), else the
             order of the rays.
-        arity : {4, 8, 16}
+        arity : {4, 8}
         levels : int, optional
             Levels above the rays; default: up to a single root.
         order : {"screen"}

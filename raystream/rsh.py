@@ -15,8 +15,8 @@ from raystream.checks import check_choice, check_count
 from raystream.errors import MemoryLimitError
 from raystream.hierarchy import ARITIES, RayHierarchy, leaf_slots
 from raystream.statistics import Statistics
-from raystream.stream import PAIR_BYTES
-from raystream.traverse import Traversal, bytes_per_pair
+from raystream.stream import LOADED, MASK_BYTES, PAIR_BYTES
+from raystream.traverse import BYTES_PER_PAIR, Traversal
 
 REDUCTIONS = ("segmented",)
 _FIRST_PAIRS = 1 << 20  # streams start with room for this many pairs and grow up to the limit
@@ -31,7 +31,7 @@ class RayspaceTracer:
     geometry : raystream.geometry.Geometry
     memory_limit : int
         Bytes that the candidate streams may take.
-    arity : {4, 8, 16}
+    arity : {4, 8}
         Children per node; 4 in the paper.
     levels : int, optional
         Node levels above the rays; the rays themselves are then not tested against the
@@ -55,8 +55,8 @@ class RayspaceTracer:
         self.session, self.geometry = session, geometry
         self._arity, self._levels, self._limit = arity, levels, memory_limit
         self._most_pairs = min(
-            memory_limit // bytes_per_pair(arity),
-            session.device.max_mem_alloc_size // PAIR_BYTES - 16,
+            memory_limit // BYTES_PER_PAIR,
+            session.device.max_mem_alloc_size // PAIR_BYTES - LOADED,
         )
         self._capacity = min(_FIRST_PAIRS, self._most_pairs)
 
@@ -92,7 +92,7 @@ class RayspaceTracer:
     def _check_room(self, hierarchy):
         """A batch of one triangle must fit: at most one pair per leaf."""
         if hierarchy.num_nodes[0] > self._most_pairs:
-            need = hierarchy.num_nodes[0] * bytes_per_pair(self._arity)
+            need = hierarchy.num_nodes[0] * BYTES_PER_PAIR
             raise MemoryLimitError(
                 f"memory_limit: {hierarchy.num_nodes[0]} rays need at least {need} bytes, "
                 f"got {self._limit} (at most {self._most_pairs} pairs per stream on this device)"
@@ -131,7 +131,7 @@ class RayspaceTracer:
         inputs = [0, *(int(n) for n in counts[1:, 2])]
         following = [*inputs[1:], 0]
         return max(
-            (bytes_per_pair(self._arity) - PAIR_BYTES) * a + PAIR_BYTES * b
+            (PAIR_BYTES + MASK_BYTES) * a + PAIR_BYTES * b
             for a, b in zip(inputs, following, strict=True)
         )
 

@@ -10,7 +10,8 @@ from raystream.statistics import STREAM_REDUCTION
 # Work-items per stream launch: enough to balance the cores, few enough to scan serially.
 CHUNKS = 512
 PAIR_BYTES = 8
-_LOADED = 16  # kernels load sixteen pairs at a time: so many more must be there to read
+MASK_BYTES = 1  # a bit per child
+LOADED = 64  # kernels load so many pairs or masks at a time: as many more must be there to read
 
 
 @dataclasses.dataclass
@@ -19,7 +20,7 @@ class PairStream:
 
     Attributes
     ----------
-    pairs : Array of shape (capacity + 16, 2) uint32
+    pairs : Array of shape (capacity + LOADED, 2) uint32
     length : Array of shape (1,) uint32
         Only the first `length` pairs mean anything.
     """
@@ -30,18 +31,13 @@ class PairStream:
     @classmethod
     def empty(cls, session, capacity):
         """An uninitialised stream of room for `capacity` pairs."""
-        pairs = session.empty((capacity + _LOADED, 2), np.uint32)
+        pairs = session.empty((capacity + LOADED, 2), np.uint32)
         return cls(pairs, session.empty(1, np.uint32))
 
     @property
     def capacity(self):
         """Pairs that it can hold."""
-        return self.pairs.shape[0] - _LOADED
-
-
-def mask_type(arity):
-    """Type of one pair's survivor mask: a bit per child."""
-    return np.uint16 if arity > 8 else np.uint8
+        return self.pairs.shape[0] - LOADED
 
 
 class Reduction:

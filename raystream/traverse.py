@@ -3,9 +3,9 @@
 import numpy as np
 
 from raystream.statistics import TRAVERSAL
-from raystream.stream import CHUNKS, PAIR_BYTES, PairStream, Reduction, mask_type
+from raystream.stream import CHUNKS, LOADED, MASK_BYTES, PAIR_BYTES, PairStream, Reduction
 
-UNIT = 16  # pairs that a kernel loads at a time
+BYTES_PER_PAIR = 2 * PAIR_BYTES + MASK_BYTES  # of capacity: a place in two streams, and a mask
 COUNTS = 3  # tests, hits, stream length of a level: cl/stream.h
 
 
@@ -38,8 +38,7 @@ class Traversal:
         self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)
         session.fill(TRAVERSAL, self.counts, 0)
         self._streams = [PairStream.empty(session, capacity) for _ in range(2)]
-        # Kernels load sixteen masks and pairs at a time; what lies behind the last is not used.
-        self._masks = session.empty(capacity + UNIT, mask_type(hierarchy.arity))
+        self._masks = session.empty(capacity + LOADED, np.uint8)
 
     @property
     def rays_per_node(self):
@@ -89,8 +88,3 @@ class Traversal:
 
     def _launch(self, kernel, *args):
         self.session.launch(TRAVERSAL, self._kernels[kernel], CHUNKS, *args)
-
-
-def bytes_per_pair(arity):
-    """What a pair of capacity costs: its place in two streams and its mask."""
-    return 2 * PAIR_BYTES + np.dtype(mask_type(arity)).itemsize
