@@ -183,7 +183,7 @@ def _scene(options):
 
 def _load(options):
     name, _, argument = options.scene.partition(":")
-    if name in PROCEDURAL and not pathlib.Path(options.scene).exists():
+    if name in PROCEDURAL and not pathlib.Path(options.scene).is_file():
         if not argument:
             return PROCEDURAL[name]()
         return PROCEDURAL[name](int(argument) if argument.isdigit() else argument)
