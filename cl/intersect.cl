@@ -8,7 +8,7 @@
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 #pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
 
-#include "stream.h"
+#include "pairs.h"
 #include "triangle.h"
 
 #define MISS 0xffffffffffffffffUL

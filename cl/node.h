@@ -21,8 +21,6 @@
 
 #include "common.h"
 
-#define CONCAT_(a, b) a##b
-#define CONCAT(a, b) CONCAT_(a, b)
 #define FLOATN CONCAT(float, ARITY)
 
 #define NODE_ROWS 10

@@ -10,9 +10,11 @@
 //   COUNT16(mask), COUNT64(mask)   number of bits set
 //   LOWEST(mask)                   number of the lowest bit set, of a mask that is not 0
 //   COMPRESS16(v, mask)            the lanes whose bit is set, moved to the front, the rest 0
+//   COMPRESS_BYTES4, 8, 16(v, mask)  the same for elements of so many bytes, a bit each
 //   STORE_MASKED(p, v, mask)       lanes whose bit is set to p[lane], the others are left alone
-//                                  (these two are defined where they are one instruction: AVX-512)
+//                                  (all of these are defined only where there is AVX-512)
 //
+//   NONZERO64(p)                   bit i: whether byte i of the 64 at p is not 0
 //   TEST64(p, bit)                 bit i: whether byte i of the 64 at p has that bit set
 //   EVEN_LANES(a, b), ODD_LANES    a0 a2 .. ae b0 b2 .. be, and a1 a3 .. af b1 b3 .. bf
 //   LOW_PAIRS(a, b), HIGH_PAIRS    a0 b0 a1 b1 .. a7 b7, and a8 b8 .. af bf
@@ -47,6 +49,19 @@ inline ulong TEST64(global const uchar *p, uint bit)
                           b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b, b};
     return __builtin_ia32_cvtb2mask512(*(global const Unaligned *)p << (7 - bit));
 }
+inline ulong NONZERO64(global const uchar *p)
+{
+    typedef Bytes64 Unaligned __attribute__((aligned(1)));
+    const Bytes64 bytes = *(global const Unaligned *)p;
+    return __builtin_ia32_cmpb512_mask(bytes, bytes ^ bytes, 4, ~0ul);
+}
+
+#define COMPRESS_BYTES4(v, mask) COMPRESS16(v, mask)
+#define COMPRESS_BYTES8(v, mask)                                                                   \
+    as_uint16(__builtin_ia32_compressdi512_mask(as_long8(v), (long8)0, (char)(mask)))
+#define COMPRESS_BYTES16(v, mask) COMPRESS_BYTES8(v, DOUBLED[mask])
+constant uchar DOUBLED[16] = {0x00, 0x03, 0x0c, 0x0f, 0x30, 0x33, 0x3c, 0x3f,
+                              0xc0, 0xc3, 0xcc, 0xcf, 0xf0, 0xf3, 0xfc, 0xff};
 #define HAS_TEST64
 #else
 inline float16 FMA16(float16 a, float16 b, float16 c)
@@ -86,6 +101,14 @@ inline uint MASK16(int16 m)
 #define ODD_LANES(a, b) (uint16)((a).odd, (b).odd)
 
 #ifndef HAS_TEST64
+inline ulong NONZERO64(global const uchar *p)
+{
+    ulong mask = 0;
+    for (uint k = 0; k < 64; k++)
+        mask |= (ulong)(p[k] != 0) << k;
+    return mask;
+}
+
 inline ulong TEST64(global const uchar *p, uint bit)
 {
     ulong mask = 0;

@@ -2,14 +2,14 @@
 //
 // The top level's nodes are tested against every triangle in a loop: its pairs are never written
 // out. Below, each pair (node, triangle) of the stream is tested against all children of the node at
-// once. Tests only mark survivors (a mask per pair, a count per chunk); cl/stream.cl makes the next
+// once. Tests only mark survivors (a mask per pair, a count per chunk); cl/pairs.cl makes the next
 // level's stream of them.
 //
-// Layouts: nodes in cl/node.h, triangle spheres in cl/geometry.cl, streams in cl/stream.h.
+// Layouts: nodes in cl/node.h, triangle spheres in cl/geometry.cl, streams in cl/pairs.h.
 // Build-time constants: ARITY, CHUNKS.
 
 #include "node.h"
-#include "stream.h"
+#include "pairs.h"
 
 // --- top level: tasks are (node, run of RUN triangles), in this order ---------------------------
 

@@ -5,7 +5,7 @@
 >>> frame.save("demo.png")
 """
 
-from raystream import scenes
+from raystream import scenes, stream
 from raystream._version import __version__
 from raystream.camera import Camera
 from raystream.device import devices
@@ -36,4 +36,5 @@ __all__ = [
     "methods",
     "render",
     "scenes",
+    "stream",
 ]

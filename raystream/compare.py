@@ -24,6 +24,7 @@ KINDS = (PRIMARY, SECONDARY, SHADOW)
 PRIMARY_SHARE = 1e-3  # rasterised pixels that may show another triangle than Embree's ray
 MIN_SSIM, MIN_PSNR = 0.995, 40.0
 TIMED_FRAMES = 3
+MOST_SECONDS = 5.0  # no further frame is timed after so long
 AMPLIFICATION = 10
 
 
@@ -162,8 +163,8 @@ def _active_rays(stream):
 def compare(scene, names, camera=None, size=(512, 512), max_bounces=2, progress=None, **options):
     """Render a scene by several methods and hold all of it against Embree.
 
-    Each method renders once to warm up, then `TIMED_FRAMES` times for the clock, then once with
-    every ray checked.
+    Each method renders once to warm up, then up to `TIMED_FRAMES` times for the clock, then once
+    with every ray checked.
 
     Parameters
     ----------
@@ -209,6 +210,8 @@ def _timed(scene, name, camera, size, max_bounces, options):
         start = time.perf_counter()
         frame = renderer.render(camera, size, max_bounces)
         seconds.append(time.perf_counter() - start)
+        if sum(seconds) > MOST_SECONDS:
+            break
     return min(seconds), frame
 
 

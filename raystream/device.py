@@ -9,7 +9,7 @@ import pyopencl.array
 import pyopencl.tools
 
 from raystream import pocl, program
-from raystream.errors import DeviceError
+from raystream.errors import DeviceError, MemoryLimitError
 from raystream.statistics import StageClock
 
 _NO_DEVICE = (
@@ -152,8 +152,25 @@ class Session:
         return array.data if array.size else self._nothing
 
     def empty(self, shape, dtype):
-        """An uninitialised device array from the pool."""
-        return cl.array.Array(self.queue, shape, np.dtype(dtype), allocator=self.pool)
+        """An uninitialised device array from the pool.
+
+        Raises
+        ------
+        MemoryLimitError
+            The device does not allow a buffer of that size, or has no memory left.
+        """
+        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        most = self.device.max_mem_alloc_size
+        if size > most:
+            raise MemoryLimitError(
+                f"{self.device.name}: need a buffer of {size} bytes, the device allows {most}"
+            )
+        try:
+            return cl.array.Array(self.queue, shape, np.dtype(dtype), allocator=self.pool)
+        except cl.MemoryError as error:
+            raise MemoryLimitError(
+                f"{self.device.name}: no memory for a buffer of {size} bytes: {error}"
+            ) from None
 
     def fill(self, stage, array, value):
         """Set every element of `array` to `value`."""

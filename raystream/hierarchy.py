@@ -6,6 +6,7 @@ import numpy as np
 
 from raystream import device
 from raystream.checks import check_choice, check_count
+from raystream.rays import Rays, from_numpy
 from raystream.statistics import HIERARCHY_CREATION
 
 ARITIES = (4, 8)
@@ -98,9 +99,9 @@ class RayHierarchy:
 
         Parameters
         ----------
-        rays : raystream.rays.Rays
-            On the device. With a `size` the leaves follow the screen (`screen_slots`), else the
-            order of the rays.
+        rays : raystream.rays.Rays or (origins, directions)
+            Rays on the device, or arrays as for `Tracer.intersect`. With a `size` the leaves
+            follow the screen (`screen_slots`), else the order of the rays.
         arity : {4, 8}
         levels : int, optional
             Levels above the rays; default: up to a single root.
@@ -115,11 +116,33 @@ class RayHierarchy:
         check_choice("order", order, ("screen",))
         if levels is not None:
             check_count("levels", levels)
+        if not isinstance(rays, Rays):
+            origins, directions = rays
+            rays = from_numpy(device.session(), origins, directions, 0.0, np.inf)
         session = device.session_of(rays.org_tnear)
         return cls(session, rays, leaf_slots(session, rays), arity, levels)
 
     def level(self, k):
-        """Level `k` on the host: (num_nodes, 10) float32, the columns the rows of cl/node.h."""
+        """The nodes of level `k`, 0 the rays, in the order of the hierarchy.
+
+        Returns
+        -------
+        spheres : (num_nodes, 4) float32
+            Centre and radius of the sphere around the rays' origins.
+        cones : (num_nodes, 4) float32
+            Unit axis and half-angle in radians; pi stands for any direction, from pi / 2 up.
+            Null nodes are NaN in both.
+        """
+        nodes = self.nodes(k)
+        spheres, cones = nodes[:, :4].copy(), nodes[:, 4:8].copy()
+        angle = np.arctan2(nodes[:, 8], nodes[:, 7])
+        cones[:, 3] = np.where(nodes[:, 7] > 0, angle, np.pi)
+        null = nodes[:, 9] < 0
+        spheres[null] = cones[null] = np.nan
+        return spheres, cones
+
+    def nodes(self, k):
+        """Level `k` as it is stored: (num_nodes, 10) float32, the columns the rows of cl/node.h."""
         blocks = self.blocks[k].get().reshape(-1, NODE_ROWS, self.arity)
         return blocks.transpose(0, 2, 1).reshape(-1, NODE_ROWS)[: self.num_nodes[k]]
 

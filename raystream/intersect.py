@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pyopencl.array as cla
 
+from raystream.pairs import CHUNKS
 from raystream.statistics import FINAL_INTERSECTION
-from raystream.stream import CHUNKS
 
 _LOCAL = 64
 _MISS = np.uint64(0xFFFFFFFFFFFFFFFF)

@@ -14,11 +14,10 @@ from raystream import intersect
 from raystream.checks import check_choice, check_count
 from raystream.errors import MemoryLimitError
 from raystream.hierarchy import ARITIES, RayHierarchy, leaf_slots
+from raystream.pairs import FUSED, LOADED, PAIR_BYTES, REDUCTIONS, bytes_per_pair
 from raystream.statistics import Statistics
-from raystream.stream import LOADED, MASK_BYTES, PAIR_BYTES
-from raystream.traverse import BYTES_PER_PAIR, Traversal
+from raystream.traverse import Traversal
 
-REDUCTIONS = ("segmented",)
 _FIRST_PAIRS = 1 << 20  # streams start with room for this many pairs and grow up to the limit
 
 
@@ -37,7 +36,10 @@ class RayspaceTracer:
         Node levels above the rays; the rays themselves are then not tested against the
         triangles' spheres (as Reis et al. 2017 run it). Default: up to one root, and the rays
         tested, as in the paper.
-    reduction : {"segmented"}
+    reduction : {"fused", "segmented", "scan", "horn", "append"}
+        How survivors become the next stream: "fused" writes them straight to their place; the
+        others write all children out first and reduce that stream by the method (see
+        `stream.reduce`), as the paper does, to show what it costs.
 
     Raises
     ------
@@ -46,16 +48,17 @@ class RayspaceTracer:
     """
 
     def __init__(
-        self, session, geometry, memory_limit, arity=4, levels=None, reduction="segmented"
+        self, session, geometry, memory_limit, arity=4, levels=None, reduction=FUSED
     ):
         check_choice("arity", arity, ARITIES)
         check_choice("reduction", reduction, REDUCTIONS)
         if levels is not None:
             check_count("levels", levels)
         self.session, self.geometry = session, geometry
-        self._arity, self._levels, self._limit = arity, levels, memory_limit
+        self._arity, self._levels, self._reduction = arity, levels, reduction
+        self._limit, self._bytes_per_pair = memory_limit, bytes_per_pair(arity, reduction)
         self._most_pairs = min(
-            memory_limit // BYTES_PER_PAIR,
+            memory_limit // self._bytes_per_pair,
             session.device.max_mem_alloc_size // PAIR_BYTES - LOADED,
         )
         self._capacity = min(_FIRST_PAIRS, self._most_pairs)
@@ -92,7 +95,7 @@ class RayspaceTracer:
     def _check_room(self, hierarchy):
         """A batch of one triangle must fit: at most one pair per leaf."""
         if hierarchy.num_nodes[0] > self._most_pairs:
-            need = hierarchy.num_nodes[0] * BYTES_PER_PAIR
+            need = hierarchy.num_nodes[0] * self._bytes_per_pair
             raise MemoryLimitError(
                 f"memory_limit: {hierarchy.num_nodes[0]} rays need at least {need} bytes, "
                 f"got {self._limit} (at most {self._most_pairs} pairs per stream on this device)"
@@ -101,7 +104,9 @@ class RayspaceTracer:
     def _run_batch(self, kernel, rays, hierarchy, result, first, last):
         """One batch of triangles; returns (counts, survivors of a level that did not fit)."""
         test_rays = self._levels is None
-        traversal = Traversal(self.session, self.geometry, hierarchy, self._capacity, test_rays)
+        traversal = Traversal(
+            self.session, self.geometry, hierarchy, self._capacity, test_rays, self._reduction
+        )
         pairs = traversal.run(first, last)
         intersect.test_pairs(
             self.session,
@@ -131,7 +136,7 @@ class RayspaceTracer:
         inputs = [0, *(int(n) for n in counts[1:, 2])]
         following = [*inputs[1:], 0]
         return max(
-            (PAIR_BYTES + MASK_BYTES) * a + PAIR_BYTES * b
+            (self._bytes_per_pair - PAIR_BYTES) * a + PAIR_BYTES * b
             for a, b in zip(inputs, following, strict=True)
         )
 

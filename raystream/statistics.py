@@ -90,6 +90,10 @@ class StageClock:
         """Note that `event` belongs to `stage`."""
         self._events.append((stage, event))
 
+    def forget(self):
+        """Drop what has been recorded: for calls whose times nobody asks for."""
+        self._events.clear()
+
     def take(self):
         """Seconds by stage since the last `take`; the events must have completed."""
         stages, last_end = {}, None

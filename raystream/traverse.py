@@ -2,11 +2,10 @@
 
 import numpy as np
 
+from raystream.pairs import CHUNKS, LOADED, PairStream, make_reduction
 from raystream.statistics import TRAVERSAL
-from raystream.stream import CHUNKS, LOADED, MASK_BYTES, PAIR_BYTES, PairStream, Reduction
 
-BYTES_PER_PAIR = 2 * PAIR_BYTES + MASK_BYTES  # of capacity: a place in two streams, and a mask
-COUNTS = 3  # tests, hits, stream length of a level: cl/stream.h
+COUNTS = 3  # tests, hits, stream length of a level: cl/pairs.h
 
 
 class Traversal:
@@ -22,6 +21,8 @@ class Traversal:
     test_rays : bool
         Whether the rays themselves (level 0) are tested against the triangles' spheres, as in the
         ray-space hierarchy's paper, or the pairs of level 1 are handed on.
+    reduction : str
+        One of `pairs.REDUCTIONS`.
 
     Attributes
     ----------
@@ -29,10 +30,10 @@ class Traversal:
         Per level, top first, and last the final tests: tests, hits, input stream length.
     """
 
-    def __init__(self, session, geometry, hierarchy, capacity, test_rays):
+    def __init__(self, session, geometry, hierarchy, capacity, test_rays, reduction):
         self.session, self.geometry, self.hierarchy = session, geometry, hierarchy
         self._kernels = session.kernels("traverse.cl", ARITY=hierarchy.arity, CHUNKS=CHUNKS)
-        self.reduction = Reduction(session, hierarchy.arity)
+        self.reduction = make_reduction(session, hierarchy.arity, reduction)
         self._last = 0 if test_rays else 1
         self.levels = list(range(hierarchy.num_levels, self._last - 1, -1))
         self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)

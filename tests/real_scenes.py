@@ -6,7 +6,11 @@ The files are not part of the repository: `$RAYSTREAM_SCENES` names their folder
 import dataclasses
 import pathlib
 
+import numpy as np
+
 import raystream as rs
+
+_SKY = (0.25, 0.35, 0.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +38,7 @@ class RealScene:
         if self.mirror is not None:
             scene.mirror(self.mirror)
         scene.set_lights([rs.PointLight(self.light)])
+        scene.background = np.array(_SKY, np.float32)
         return scene
 
     @property

@@ -7,7 +7,7 @@ import pytest
 
 import raystream as rs
 from raystream import device
-from raystream.errors import DeviceError
+from raystream.errors import DeviceError, MemoryLimitError
 
 
 def test_devices_are_listed_and_one_is_the_default():
@@ -53,6 +53,12 @@ def test_stage_times_add_up(session):
     for seconds in stages.values():
         assert 0 < seconds["device"] <= seconds["wall"]
     assert session.finish() == {}
+
+
+def test_too_large_a_buffer_is_one_clear_error(session):
+    size = session.device.max_mem_alloc_size + 4
+    with pytest.raises(MemoryLimitError, match=f"need a buffer of {size} bytes, the device allows"):
+        session.empty(size // 4, np.float32)
 
 
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (1,), (65, 3)])

@@ -44,7 +44,7 @@ def assert_bounds(hierarchy, origins, directions, tfar):
     unit = directions / length[:, None]
     active = tfar >= 0
     for k in range(hierarchy.num_levels + 1):
-        nodes = hierarchy.level(k).astype(np.float64)
+        nodes = hierarchy.nodes(k).astype(np.float64)
         of_ray = np.arange(len(origins)) // hierarchy.arity**k
         centre, radius, axis, cosine, sine, reach = np.split(
             nodes[of_ray], [3, 4, 7, 8, 9], axis=1
@@ -70,7 +70,7 @@ def test_nodes_bound_their_rays(rng, arity, count):
     hierarchy = rs.RayHierarchy.build(stream(origins, directions, tfar), arity=arity)
     assert hierarchy.num_nodes[-1] == 1
     assert_bounds(hierarchy, origins, directions, tfar)
-    levels = [hierarchy.level(k) for k in range(hierarchy.num_levels + 1)]
+    levels = [hierarchy.nodes(k) for k in range(hierarchy.num_levels + 1)]
     assert hierarchy.count_nodes() == [int((nodes[:, 9] >= 0).sum()) for nodes in levels]
 
 
@@ -98,7 +98,7 @@ def test_parallel_opposite_and_tiny_directions():
     origins = np.zeros((16, 3), np.float32)
     hierarchy = rs.RayHierarchy.build(stream(origins, directions))
     assert_bounds(hierarchy, origins, directions, np.full(16, np.inf, np.float32))
-    parallel, tiny, opposite, _ = hierarchy.level(1)
+    parallel, tiny, opposite, _ = hierarchy.nodes(1)
     assert parallel[8] < 1e-6 and tiny[8] < 1e-6 and opposite[7] <= 0
 
 
@@ -110,3 +110,18 @@ def test_parallel_opposite_and_tiny_directions():
 def test_options_that_there_are_not(option, message):
     with pytest.raises(ValueError, match=message):
         rs.RayHierarchy.build(stream(np.zeros((4, 3)), np.ones((4, 3))), **option)
+
+
+def test_levels_can_be_inspected():
+    origins = np.array([[0, 0, 0], [2, 0, 0], [0, 0, 0], [0, 0, 0], [5, 5, 5]], np.float32)
+    directions = np.array([[0, 0, 2], [0, 0, 1], [1, 0, 1], [-1, 0, 1], [0, 1, 0]], np.float32)
+    hierarchy = rs.RayHierarchy.build((origins, directions))
+    spheres, cones = hierarchy.level(0)
+    np.testing.assert_array_equal(spheres, np.column_stack([origins, np.zeros(5)]))
+    np.testing.assert_allclose(cones[:2], [[0, 0, 1, 0]] * 2)
+    spheres, cones = hierarchy.level(1)
+    np.testing.assert_allclose(spheres[0], [1, 0, 0, 1], rtol=1e-5)
+    np.testing.assert_allclose(cones[0], [0, 0, 1, np.pi / 4], atol=1e-5)
+    holes = stream(origins, directions, np.array([1, 1, 1, 1, -1], np.float32))
+    for part in rs.RayHierarchy.build(holes).level(1):
+        assert np.isnan(part[1]).all() and np.isfinite(part[0]).all()

@@ -30,7 +30,8 @@ def assert_nothing_lost(scene, origins, directions, tfar=np.inf, **options):
 
 
 @pytest.mark.parametrize("options", [
-    {}, {"arity": 8}, {"levels": 1}, {"arity": 8, "levels": 2},
+    {}, {"reduction": "segmented"}, {"reduction": "scan"}, {"reduction": "horn"},
+    {"reduction": "append", "arity": 8}, {"arity": 8}, {"levels": 1}, {"arity": 8, "levels": 2},
     {"levels": 5},
 ])  # fmt: skip
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 64, 65, 1009])
@@ -138,6 +139,18 @@ def test_counts_are_the_same_from_run_to_run_and_in_any_number_of_batches(rng):
         assert second["peak_stream_bytes"] <= limit
         for key in ("levels", "final_tests", "final_hits", "total_tests", "rays"):
             assert second[key] == first[key], key
+
+
+@pytest.mark.parametrize("reduction", ["segmented", "scan", "horn", "append"])
+def test_counts_do_not_depend_on_the_reduction(rng, reduction):
+    scene, rays = triangle_soup(rng, 800, size=0.4), random_rays(rng, 500)
+    fused = rs.Tracer(scene, "rsh")
+    hits = fused.intersect(*rays)
+    other = rs.Tracer(scene, "rsh", reduction=reduction, memory_limit=500_000)
+    assert_same_hits(other.intersect(*rays), hits)
+    assert other.statistics.levels == fused.statistics.levels
+    assert other.statistics.final_hits == fused.statistics.final_hits
+    assert other.statistics.peak_stream_bytes <= 500_000
 
 
 def test_streams_grow_before_batches_are_cut(rng, monkeypatch):

@@ -146,7 +146,7 @@ def test_strings_are_refused():
     ({"method": "brute", "arity": 4}, "no option 'arity'; its options: none"),
     ({"arity": 5}, "arity: need one of 4, 8, got 5"),
     ({"levels": -1}, "levels: need a whole number"),
-    ({"reduction": "sorted"}, "reduction: need one of 'segmented'"),
+    ({"reduction": "sorted"}, "reduction: need one of 'fused'"),
     ({"memory_limit": 0}, "memory_limit"),
 ])  # fmt: skip
 def test_bad_options_are_refused(options, message):

@@ -7,7 +7,7 @@
 //
 // Build-time constants: CHUNKS, ARITY.
 
-#include "stream.h"
+#include "pairs.h"
 
 // One work-item. offsets[c] = survivors before chunk c; *out_length = their total, or 0 where they
 // exceed `capacity`: then nothing below runs, and *overflow keeps the total for the host.
@@ -52,6 +52,22 @@ inline void write_survivors(global const Pair *pairs, uint16 t, uint node, uint 
             *out++ = (Pair)(node, pairs[k].y);
     }
 #endif
+}
+
+// The stream as the paper's traversal leaves it: all children of every pair, with a flag each, for a
+// stream reduction of its own (cl/reduce.cl).
+kernel void expand_children(global const uint *restrict in_length, global const Pair *restrict in,
+                            global const Mask *restrict masks, global Pair *restrict children,
+                            global uchar *restrict keep)
+{
+    const uint n = *in_length;
+    for (uint i = chunk_begin(n), end = chunk_end(n); i < end; i++) {
+        const Pair pair = in[i];
+        for (uint child = 0; child < ARITY; child++) {
+            children[(ulong)i * ARITY + child] = (Pair)(pair.x * ARITY + child, pair.y);
+            keep[(ulong)i * ARITY + child] = (masks[i] >> child) & 1;
+        }
+    }
 }
 
 inline ulong first_bits(uint count) { return count < 64 ? (1ul << count) - 1 : ~0ul; }
