@@ -17,8 +17,8 @@
 //   radix sort          KEY, VALUE, unsigned types of their sizes
 //
 // Invariants: every work-item of a group reaches every barrier. The last tile of a stream may be
-// partly filled: loads past its end give zero, stores past it are left out. Partials are combined
-// in the order of the stream, so sums of floats do not change from run to run.
+// partly filled: what lies past its end counts for nothing and is not written. Sums are joined by
+// the same tree each time, so those of floats do not change from run to run.
 
 #ifdef ELEMENT
 #define TYPE uint

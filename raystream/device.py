@@ -122,7 +122,9 @@ class Session:
         self.queue = cl.CommandQueue(
             self.context, device, properties=cl.command_queue_properties.PROFILING_ENABLE
         )
-        self.pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self.queue))
+        # Two bin sizes an octave: what calls of many sizes leave behind in the pool stays bounded.
+        self._allocator = cl.tools.ImmediateAllocator(self.queue)
+        self.pool = cl.tools.MemoryPool(self._allocator, leading_bits_in_bin_id=1)
         self._nothing = self.pool.allocate(64)
         self.clock = StageClock()
         self.cache = {}  # small device arrays that stages keep between calls, by their own keys
@@ -167,7 +169,16 @@ class Session:
             )
         try:
             return cl.array.Array(self.queue, shape, np.dtype(dtype), allocator=self.pool)
-        except cl.MemoryError as error:
+        except (cl.MemoryError, cl.LogicError):
+            return self._empty_without_pool(shape, np.dtype(dtype), size)
+
+    def _empty_without_pool(self, shape, dtype, size):
+        """What the pool cannot give: it rounds sizes up, and holds what it has given before."""
+        self.queue.finish()
+        self.pool.free_held()
+        try:
+            return cl.array.Array(self.queue, shape, dtype, allocator=self._allocator)
+        except (cl.MemoryError, cl.LogicError) as error:
             raise MemoryLimitError(
                 f"{self.device.name}: no memory for a buffer of {size} bytes: {error}"
             ) from None

@@ -115,19 +115,22 @@ class SeparateReduction(Reduction):
     the stream back at every level.
     """
 
-    def __init__(self, session, arity, method):
+    def __init__(self, session, arity, method, capacity):
         super().__init__(session, arity)
         self._method = method
         self._reducer = Reducer(session, PAIR_BYTES)
         self._total = session.empty(1, np.uint32)
+        # All of one size, whatever a level needs: the pool has them again at the next call.
+        self._children, self._scratch = (
+            session.empty((capacity * arity, 2), np.uint32) for _ in range(2)
+        )
+        self._keep = session.empty(capacity * arity, np.uint8)
 
     def scatter(self, source, masks, target):
         """As `Reduction.scatter`."""
         if int(target.length.get()[0]) == 0:
             return
         count = int(source.length.get()[0]) * self.arity
-        children = self.session.empty((count, 2), np.uint32)
-        keep = self.session.empty(count, np.uint8)
         self.session.launch(
             STREAM_REDUCTION,
             self._kernels["expand_children"],
@@ -135,18 +138,18 @@ class SeparateReduction(Reduction):
             source.length,
             source.pairs,
             masks,
-            children,
-            keep,
+            self._children,
+            self._keep,
         )
-        arrays = children, keep, target.pairs, self._total
-        self._reducer.reduce(self._method, *arrays, SEGMENT_SIZE)
+        arrays = self._children, self._keep, target.pairs, self._total
+        self._reducer.reduce(self._method, count, *arrays, SEGMENT_SIZE, self._scratch)
 
 
-def make_reduction(session, arity, name):
-    """The reduction of that name, one of `REDUCTIONS`."""
+def make_reduction(session, arity, name, capacity):
+    """The reduction of that name, one of `REDUCTIONS`, for streams of up to `capacity` pairs."""
     if name == FUSED:
         return Reduction(session, arity)
-    return SeparateReduction(session, arity, name)
+    return SeparateReduction(session, arity, name, capacity)
 
 
 def bytes_per_pair(arity, reduction):

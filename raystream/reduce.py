@@ -31,50 +31,52 @@ class Reducer:
         )
         self._offsets = session.empty(self._chunks + 1, np.uint64)
 
-    def reduce(self, method, values, keep, out, total, segment_size):
-        """Survivors of `values` to the front of `out`, their number to `total`.
+    def reduce(self, method, count, values, keep, out, total, segment_size, scratch=None):
+        """Survivors among the first `count` values to the front of `out`, their number to `total`.
 
         Parameters
         ----------
         method : str
             One of `METHODS`.
-        values, out : Array of n elements
-        keep : Array of shape (n,) uint8
+        count : int
+        values, out : Array of at least `count` elements
+        keep : Array of at least `count` uint8
         total : Array of shape (1,) uint32
         segment_size : int
             For "segmented".
+        scratch : Array like `values`, optional
+            Room for the segments of "segmented"; allocated where it is not given.
         """
-        count = keep.shape[0]
         if count == 0:
             self.session.fill(STREAM_REDUCTION, total, 0)
         elif method == "segmented":
-            segments = self.session.empty(values.shape, values.dtype)
+            if scratch is None:
+                scratch = self.session.empty(values.shape, values.dtype)
             lengths = self.session.empty(-(-count // segment_size), np.uint32)
-            self.segments(values, keep, segments, lengths, segment_size)
+            self.segments(count, values, keep, scratch, lengths, segment_size)
             self._launch("scan_counts", 1, self._offsets, total)
             sizes = np.uint64(count), np.uint64(segment_size)
-            self._launch("concatenate", self._chunks, *sizes, segments, lengths, self._offsets, out)
+            self._launch("concatenate", self._chunks, *sizes, scratch, lengths, self._offsets, out)
         elif method == "scan":
             n = np.uint64(count)
             self._launch("count_kept", self._chunks, n, keep, self._offsets)
             self._launch("scan_counts", 1, self._offsets, total)
             self._launch("write_kept", self._chunks, n, values, keep, self._offsets, out)
         elif method == "horn":
-            self._horn(values, keep, out, total)
+            self._horn(np.uint64(count), values, keep, out, total)
         else:
             self.session.fill(STREAM_REDUCTION, total, 0)
             blocks = -(-count // _APPEND_BLOCK)
             self._launch("append_kept", blocks, np.uint64(count), values, keep, out, total)
 
-    def segments(self, values, keep, segments, lengths, segment_size):
+    def segments(self, count, values, keep, segments, lengths, segment_size):
         """Each segment reduced alone: survivors of segment s from place s * segment_size on."""
-        sizes = np.uint64(keep.shape[0]), np.uint64(segment_size)
+        sizes = np.uint64(count), np.uint64(segment_size)
         arrays = values, keep, segments, lengths, self._offsets
         self._launch("reduce_segments", self._chunks, *sizes, *arrays)
 
-    def _horn(self, values, keep, out, total):
-        count = np.uint64(keep.shape[0])
-        sums, other = (self.session.empty(keep.shape, np.uint32) for _ in range(2))
+    def _horn(self, count, values, keep, out, total):
+        sums, other = (self.session.empty(int(count), np.uint32) for _ in range(2))
         self._launch("count_rejected", self._chunks, count, keep, sums)
         distance = 1
         while distance < count:

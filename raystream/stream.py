@@ -54,7 +54,7 @@ def reduce(values, keep, method="segmented", segment_size=None):
     out, total = session.empty(source.shape, source.dtype), session.empty(1, np.uint32)
     if _walks_chunks(session) or method in ("horn", "append"):
         reducer = Reducer(session, _element_bytes("values", values))
-        reducer.reduce(method, source, flags, out, total, size)
+        reducer.reduce(method, len(values), source, flags, out, total, size)
     else:
         groups.reduce(session, source, flags, out, total)
     if call.on_device:
@@ -87,7 +87,7 @@ def reduce_segments(values, keep, segment_size=None):
     lengths = call.session.empty(-(-len(values) // size), np.uint32)
     if len(values):
         reducer = Reducer(call.session, _element_bytes("values", values))
-        reducer.segments(source, flags, segments, lengths, size)
+        reducer.segments(len(values), source, flags, segments, lengths, size)
     if call.on_device:
         return call.result(_like(segments, values)), call.result(lengths)
     host = call.result(segments).view(_dtype(values)).reshape(values.shape)

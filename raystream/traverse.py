@@ -33,7 +33,7 @@ class Traversal:
     def __init__(self, session, geometry, hierarchy, capacity, test_rays, reduction):
         self.session, self.geometry, self.hierarchy = session, geometry, hierarchy
         self._kernels = session.kernels("traverse.cl", ARITY=hierarchy.arity, CHUNKS=CHUNKS)
-        self.reduction = make_reduction(session, hierarchy.arity, reduction)
+        self.reduction = make_reduction(session, hierarchy.arity, reduction, capacity)
         self._last = 0 if test_rays else 1
         self.levels = list(range(hierarchy.num_levels, self._last - 1, -1))
         self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)

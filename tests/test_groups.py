@@ -71,8 +71,8 @@ def run_reduce(values, keep):
     session = device.session()
     out, count = upload(np.full_like(values, SENTINEL)), upload(np.array([SENTINEL], np.uint32))
     groups.reduce(session, upload(values), upload(keep), out, count)
-    number = int(count.get()[0])
-    result = out.get()
+    number, result = int(count.get()[0]), out.get()
+    assert number == np.count_nonzero(keep)
     assert (result[number:] == SENTINEL).all()
     return result[:number]
 

@@ -20,7 +20,14 @@ from real_scenes import BUNNY, PATIO
 
 import raystream as rs
 from raystream import device
-from raystream.statistics import GEOMETRY, RASTERISATION
+from raystream.pairs import REDUCTIONS
+from raystream.statistics import (
+    FINAL_INTERSECTION,
+    GEOMETRY,
+    RASTERISATION,
+    STREAM_REDUCTION,
+    TRAVERSAL,
+)
 
 SIZE = (512, 512)
 
@@ -91,6 +98,37 @@ def main():
         for stage, seconds in stages.items():
             print(f"  {stage}: {seconds['wall'] * 1e3:.1f} ms, {seconds['wall'] / total:.1%}")
     frame_times()
+    for name, scene, camera in frames_of_reductions(folder):
+        compare_reductions(name, scene, camera)
+
+
+def frames_of_reductions(folder):
+    """The scenes whose whole frames show what a stream reduction of its own costs."""
+    yield "mirror ball in sponza", PATIO.load(folder), PATIO.camera
+    bumpy = rs.scenes.bumpy_mirror(3)
+    yield "bumpy mirror, n = 3", bumpy, bumpy.camera
+
+
+def compare_reductions(name, scene, camera):
+    """Frame time and stage times of every reduction, and their ratio to the fused one."""
+    print(f"{name}: frame at 512 x 512 by reduction")
+    fused = None
+    for reduction in REDUCTIONS:
+        renderer = rs.Renderer(scene, "rsh", reduction=reduction)
+        renderer.render(camera, SIZE)
+        frames = [timed_frame(renderer, camera) for _ in range(1 if reduction == "horn" else 3)]
+        seconds, frame = min(frames, key=lambda pair: pair[0])
+        fused = fused or seconds
+        stages = frame.statistics.stages
+        parts = (TRAVERSAL, STREAM_REDUCTION, FINAL_INTERSECTION)
+        shares = ", ".join(f"{stage} {stages[stage]['wall'] * 1e3:.0f} ms" for stage in parts)
+        print(f"  {reduction}: {seconds * 1e3:.0f} ms, {seconds / fused:.2f} of fused; {shares}")
+
+
+def timed_frame(renderer, camera):
+    start = time.perf_counter()
+    frame = renderer.render(camera, SIZE)
+    return time.perf_counter() - start, frame
 
 
 def frame_times():

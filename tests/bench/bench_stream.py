@@ -80,7 +80,7 @@ def reductions(bench, share):
     reducer = Reducer(bench.session, 8)
 
     def device_run(method, size):
-        return lambda: reducer.reduce(method, values, flags, out, total, size)
+        return lambda: reducer.reduce(method, bench.count, values, flags, out, total, size)
 
     for method in METHODS:
         runs = 3 if method == "horn" else 7
@@ -88,7 +88,8 @@ def reductions(bench, share):
     name = f"segmented, s = {PAPER_SEGMENT}"
     yield name, moved / bench.median(device_run("segmented", PAPER_SEGMENT))
     lengths = bench.session.empty(-(-bench.count // SEGMENT_SIZE), np.uint32)
-    in_place = bench.median(lambda: reducer.segments(values, flags, out, lengths, SEGMENT_SIZE))
+    arrays = values, flags, out, lengths
+    in_place = bench.median(lambda: reducer.segments(bench.count, *arrays, SEGMENT_SIZE))
     yield "segments left in place", moved / in_place
     host = np.arange(bench.count, dtype=np.uint64)
     yield "numpy boolean indexing", moved / bench.median(lambda: host[keep.view(bool)], 3)
@@ -179,7 +180,7 @@ def test_reduce(benchmark, bench, method, share):
     total, reducer = bench.session.empty(1, np.uint32), Reducer(bench.session, 8)
 
     def run():
-        reducer.reduce(method, values, flags, out, total, SEGMENT_SIZE)
+        reducer.reduce(method, bench.count, values, flags, out, total, SEGMENT_SIZE)
         bench.session.finish()
 
     benchmark.pedantic(run, rounds=5, warmup_rounds=1)
