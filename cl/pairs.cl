@@ -54,8 +54,9 @@ inline void write_survivors(global const Pair *pairs, uint16 t, uint node, uint 
 #endif
 }
 
-// The stream as the paper's traversal leaves it: all children of every pair, with a flag each, for a
-// stream reduction of its own (cl/reduce.cl).
+// The stream as the paper's traversal leaves it, for a stream reduction of its own (cl/reduce.cl): all
+// children of every pair with a flag each, first child 0 of all pairs, then child 1, ... (the paper's
+// four render targets), so that runs stay runs.
 kernel void expand_children(global const uint *restrict in_length, global const Pair *restrict in,
                             global const Mask *restrict masks, global Pair *restrict children,
                             global uchar *restrict keep)
@@ -64,8 +65,8 @@ kernel void expand_children(global const uint *restrict in_length, global const 
     for (uint i = chunk_begin(n), end = chunk_end(n); i < end; i++) {
         const Pair pair = in[i];
         for (uint child = 0; child < ARITY; child++) {
-            children[(ulong)i * ARITY + child] = (Pair)(pair.x * ARITY + child, pair.y);
-            keep[(ulong)i * ARITY + child] = (masks[i] >> child) & 1;
+            children[(ulong)n * child + i] = (Pair)(pair.x * ARITY + child, pair.y);
+            keep[(ulong)n * child + i] = (masks[i] >> child) & 1;
         }
     }
 }

@@ -74,6 +74,7 @@ def check_device(device):
             raise DeviceError(f"{device.name}: {failure}")
 
 
+_POOL_SHARE = 2  # the pool holds no more than this part of the device's memory
 _thread = threading.local()
 
 
@@ -149,6 +150,11 @@ class Session:
         rounded = -(-size // local) * local
         self.clock.record(stage, kernel(self.queue, (rounded,), (local,), *buffers))
 
+    def trim(self):
+        """Give the memory back that the pool holds and no array uses."""
+        self.queue.finish()
+        self.pool.free_held()
+
     def _buffer(self, array):
         # An empty array has no buffer, and PoCL ends the process where a kernel's argument is null.
         return array.data if array.size else self._nothing
@@ -167,6 +173,8 @@ class Session:
             raise MemoryLimitError(
                 f"{self.device.name}: need a buffer of {size} bytes, the device allows {most}"
             )
+        if self.pool.managed_bytes + size > self.device.global_mem_size // _POOL_SHARE:
+            self.trim()
         try:
             return cl.array.Array(self.queue, shape, np.dtype(dtype), allocator=self.pool)
         except (cl.MemoryError, cl.LogicError):
@@ -174,8 +182,7 @@ class Session:
 
     def _empty_without_pool(self, shape, dtype, size):
         """What the pool cannot give: it rounds sizes up, and holds what it has given before."""
-        self.queue.finish()
-        self.pool.free_held()
+        self.trim()
         try:
             return cl.array.Array(self.queue, shape, dtype, allocator=self._allocator)
         except (cl.MemoryError, cl.LogicError) as error:

@@ -125,6 +125,7 @@ class RayspaceTracer:
         """The batches that replace one that overflowed; the streams grow first, up to the limit."""
         if self._capacity < self._most_pairs:
             self._capacity = min(max(2 * self._capacity, 2 * survivors), self._most_pairs)
+            self.session.trim()  # the smaller streams are not needed again
             return [(first, last)]
         # `_check_room` made sure that a batch of one triangle never comes here.
         pieces = max(2, -(-2 * survivors // self._capacity))

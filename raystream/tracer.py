@@ -17,7 +17,9 @@ from raystream.statistics import Statistics
 
 _METHODS = {"brute": Brute, "rsh": RayspaceTracer}
 _COMMON = ("self", "session", "geometry", "memory_limit")
-_MEMORY_SHARE = 4  # the default memory_limit is this part of the device's memory
+# The default memory_limit: a part of the device's memory, and no more than needed to be fast.
+_MEMORY_SHARE = 4
+_MOST_MEMORY = 1 << 30
 
 
 def methods():
@@ -58,7 +60,8 @@ class Tracer:
     device : pyopencl.Device, optional
         Default: ``$PYOPENCL_CTX`` if set, else the first GPU, else the CPU.
     memory_limit : int, optional
-        Bytes that the candidates of one call may take; default: a quarter of the device's memory.
+        Bytes that the candidates of one call may take; default: 1 GiB, or a quarter of the device's
+        memory where that is less.
     **options
         Of the method: see `raystream.rsh.RayspaceTracer`.
 
@@ -183,7 +186,9 @@ class Tracer:
         backend = self._backends.get(session)
         if backend is None:
             geometry = Geometry(session, self.scene)
-            limit = self._memory_limit or session.device.global_mem_size // _MEMORY_SHARE
+            limit = self._memory_limit or min(
+                session.device.global_mem_size // _MEMORY_SHARE, _MOST_MEMORY
+            )
             method = _METHODS[self.method](session, geometry, limit, **self._options)
             backend = self._backends[session] = _Backend(geometry, method, version=0)
         if backend.version != self._version:
