@@ -22,7 +22,7 @@ demo: $(VENV)/ready  ## Render a procedural scene, check it against Embree, writ
 	$(BIN)/raystream compare demo --methods rsh,embree -o demo
 
 bench: $(VENV)/ready  ## Run the benchmarks (performance is measured here, never in tests).
-	$(BIN)/python -m pip install --quiet '.[bench]'
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python -m pytest tests/bench -o python_files='bench_*.py'
 
 clean:  ## Remove the environment and what the demo wrote.

@@ -5,8 +5,6 @@
 
 #include "triangle.h"
 
-#define MISS 0xffffffffffffffffUL
-
 // Lanes past the last ray, and inactive rays, get tfar = -1 and so never hit.
 inline RayFrame16 ray_frame16(uint first, uint num_rays, global const float4 *org_tnear,
                               global const float4 *dir_tfar)
@@ -71,7 +69,7 @@ kernel void intersect_brute(const uint num_rays, const uint num_triangles,
     *(int16 *)id = nearest;
     for (uint lane = 0; lane < 16 && first + lane < num_rays; lane++) {
         const bool hit = (uint)id[lane] != INVALID;
-        closest[first + lane] = hit ? ((ulong)as_uint(t[lane]) << 32) | (uint)id[lane] : MISS;
+        closest[first + lane] = hit ? hit_key(t[lane], (uint)id[lane]) : MISS;
     }
     counts[2 * get_global_id(0)] = sum16(-(frame.tfar >= frame.tnear));
     counts[2 * get_global_id(0) + 1] = sum16(count);

@@ -23,3 +23,9 @@ inline float4 cross3(float4 a, float4 b)
 {
     return (float4)(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x, 0.0f);
 }
+
+#ifdef CHUNKS
+// Chunk of this work-item in a stream of n elements that CHUNKS of them share: first, and last + 1.
+inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
+inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
+#endif

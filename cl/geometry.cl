@@ -14,26 +14,45 @@
 
 #define RADIUS_SLACK (1.0f + 0x1p-20f)
 
+inline float largest(float4 v)
+{
+    const float4 m = fabs(v);
+    return MAX(m.x, MAX(m.y, m.z));
+}
+
+// Centre from the first vertex, for edges ab and ac of a size near one.
+inline float4 relative_centre(float4 ab, float4 ac)
+{
+    const float4 bc = ac - ab;
+    const float ab2 = dot3(ab, ab), ac2 = dot3(ac, ac), bc2 = dot3(bc, bc);
+    if (ab2 >= ac2 + bc2)
+        return 0.5f * ab;
+    if (ac2 >= ab2 + bc2)
+        return 0.5f * ac;
+    if (bc2 >= ab2 + ac2)
+        return ab + 0.5f * bc;
+    // Acute, so the denominator is well away from zero.
+    const float4 n = cross3(ab, ac);
+    return (ac2 * cross3(n, ab) + ab2 * cross3(ac, n)) / (2.0f * dot3(n, n));
+}
+
+// Everything is divided by the largest component before it is multiplied: the fifth power of an edge
+// leaves the range of float from lengths of 1e-8 and 5e7 on.
 inline float4 bounding_sphere(float4 a, float4 b, float4 c)
 {
-    const float4 ab = b - a, ac = c - a, bc = c - b;
-    const float ab2 = dot3(ab, ab), ac2 = dot3(ac, ac), bc2 = dot3(bc, bc);
-    float4 centre;
-    if (ab2 >= ac2 + bc2) {
-        centre = a + 0.5f * ab;
-    } else if (ac2 >= ab2 + bc2) {
-        centre = a + 0.5f * ac;
-    } else if (bc2 >= ab2 + ac2) {
-        centre = b + 0.5f * bc;
-    } else {
-        // Acute, so the denominator is well away from zero.
-        const float4 n = cross3(ab, ac);
-        centre = a + (ac2 * cross3(n, ab) + ab2 * cross3(ac, n)) / (2.0f * dot3(n, n));
+    const float size = MAX(largest(b - a), largest(c - a));
+    float4 sphere = a;
+    if (size > 0.0f)
+        sphere += size * relative_centre((b - a) / size, (c - a) / size);
+    const float4 da = a - sphere, db = b - sphere, dc = c - sphere;
+    const float far = MAX(largest(da), MAX(largest(db), largest(dc)));
+    sphere.w = 0.0f;
+    if (far > 0.0f) {
+        const float4 ea = da / far, eb = db / far, ec = dc / far;
+        const float2 squares = (float2)(MAX(dot3(ea, ea), dot3(eb, eb)), dot3(ec, ec));
+        sphere.w = far * sqrt(MAX(squares.x, squares.y)) * RADIUS_SLACK;
     }
-    const float4 da = a - centre, db = b - centre, dc = c - centre;
-    const float2 far = (float2)(MAX(dot3(da, da), dot3(db, db)), dot3(dc, dc));
-    centre.w = sqrt(MAX(far.x, far.y)) * RADIUS_SLACK;
-    return centre;
+    return sphere;
 }
 
 // One work-item gathers one block of 16 triangles.

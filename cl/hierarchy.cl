@@ -58,7 +58,7 @@ kernel void build_leaves(const uint num_leaves, const uint num_slots,
                 const float length = sqrt(dot3(e, e));
                 n.centre = o;
                 n.axis = e / length;
-                n.reach = d.w * (length * scale) * REACH_SLACK;
+                n.reach = d.w * scale * length * REACH_SLACK; // 0 * inf must not arise
             }
         }
         store_node(blocks, i, n);
@@ -116,6 +116,10 @@ inline Node enclose(const Node *children, uint count)
         n.radius = MAX(n.radius, radius);
     }
     n.radius *= RADIUS_SLACK;
+    if (!(n.radius < INFINITY)) { // origins so far apart bound nothing, but lose nothing either
+        n.centre = 0.0f;
+        n.radius = INFINITY;
+    }
     const float length = sqrt(dot3(sum, sum));
     n.axis = sum / length;
     // Opposite axes cancel: any direction then. NaN compares false, too.

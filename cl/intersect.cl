@@ -1,19 +1,12 @@
 // Final ray-triangle intersection, and what all tracers share: resolving hits.
 //
-// The closest hit of a ray is the 64-bit minimum over (bits of t, triangle): t >= 0, so its bits sort
-// like its value, and equal distances go to the smaller triangle, whatever the order of work.
-//
-// Build-time constants: CHUNKS, ARITY.
+// Build-time constant: CHUNKS.
 
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 #pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
 
 #include "pairs.h"
 #include "triangle.h"
-
-#define MISS 0xffffffffffffffffUL
-
-inline ulong hit_key(float t, uint triangle) { return ((ulong)as_uint(t) << 32) | triangle; }
 
 inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
 {
@@ -29,10 +22,10 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
                      global const uint *restrict slots, global const float4 *restrict org_tnear,   \
                      global const float4 *restrict dir_tfar,                                       \
                      global const float4 *restrict triangles, global RESULT *restrict result,      \
-                     global uint *restrict chunk_tests, global uint *restrict chunk_hits)          \
+                     global ulong *restrict chunk_tests, global ulong *restrict chunk_hits)        \
     {                                                                                              \
         const uint n = *length;                                                                    \
-        uint tests = 0, hits = 0;                                                                  \
+        ulong tests = 0, hits = 0;                                                                 \
         for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {                              \
             const uint count = run_length(pairs, i, end);                                          \
             for (uint k = 0; k < rays_per_node; k++) {                                             \
@@ -75,8 +68,8 @@ DEFINE_INTERSECT_PAIRS(intersect_pairs, ulong, atom_min(result + ray, nearest))
 DEFINE_INTERSECT_PAIRS(occlude_pairs, uchar, result[ray] = 1)
 
 // One work-item: row `row` of counts grows by the chunks' counts of the final tests.
-kernel void sum_final(global const uint *restrict length, global const uint *restrict chunk_tests,
-                      global const uint *restrict chunk_hits, global ulong *restrict counts,
+kernel void sum_final(global const uint *restrict length, global const ulong *restrict chunk_tests,
+                      global const ulong *restrict chunk_hits, global ulong *restrict counts,
                       const uint row)
 {
     global ulong *level = counts + row * LEVEL_COUNTS;

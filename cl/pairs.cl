@@ -14,8 +14,8 @@
 // Row `row` of counts grows by the chunks' sums.
 kernel void scan_chunks(const uint capacity, const ulong in_length,
                         global const uint *restrict in_stream_length,
-                        global const uint *restrict chunk_tests,
-                        global const uint *restrict chunk_hits, global uint *restrict offsets,
+                        global const ulong *restrict chunk_tests,
+                        global const ulong *restrict chunk_hits, global uint *restrict offsets,
                         global uint *restrict out_length, global ulong *restrict overflow,
                         global ulong *restrict counts, const uint row)
 {

@@ -23,11 +23,6 @@ typedef uchar Mask;
 #define LEVEL_STREAM 2 // length of the level's input stream
 #define LEVEL_COUNTS 3
 
-// Chunk of this work-item in a stream of n elements: first, and last + 1.
-inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
-
-inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
-
 #define NODES_OF(pairs)                                                                            \
     EVEN_LANES(LOAD_UNALIGNED(uint16, (global const uint *)(pairs)),                               \
                LOAD_UNALIGNED(uint16, (global const uint *)((pairs) + WIDTH / 2)))

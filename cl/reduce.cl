@@ -17,9 +17,6 @@
 
 #define PER_VECTOR (64 / BYTES)
 
-inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
-inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
-
 inline ulong count_range(global const uchar *keep, ulong begin, ulong end)
 {
     ulong count = 0;

@@ -11,9 +11,6 @@
 
 #include "common.h"
 
-inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
-inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
-
 kernel void sum_chunks(const ulong first, const ulong n, global const TYPE *restrict values,
                        global TYPE *restrict sums)
 {

@@ -10,9 +10,6 @@
 
 #include "common.h"
 
-inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
-inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
-
 #ifdef FROM_PACKED
 #define LOAD_KEY(i) packed_in[i].x
 #else

@@ -38,11 +38,11 @@ inline uint test_block(global const float *blocks, uint node, global const float
 // Triangles first_triangle .. last_triangle are this batch.
 kernel void count_top(const uint num_nodes, const uint first_triangle, const uint last_triangle,
                       global const float *restrict blocks, global const float16 *restrict sphere_rows,
-                      global uint *restrict chunk_tests, global uint *restrict chunk_hits)
+                      global ulong *restrict chunk_tests, global ulong *restrict chunk_hits)
 {
     const uint runs = (last_triangle - first_triangle + RUN - 1) / RUN;
     const ulong tasks = (ulong)num_nodes * runs;
-    uint tests = 0, hits = 0;
+    ulong tests = 0, hits = 0;
     for (ulong task = chunk_begin(tasks), end = chunk_end(tasks); task < end; task++) {
         const uint node = task / runs;
         const uint begin = first_triangle + (task % runs) * RUN;
@@ -125,10 +125,10 @@ inline void store_masks(global Mask *masks, uchar16 values, uint count)
 kernel void test_children(global const uint *restrict length, global const Pair *restrict pairs,
                           global const float *restrict blocks, global const uint *restrict valid,
                           global const float4 *restrict spheres, global Mask *restrict masks,
-                          global uint *restrict chunk_tests, global uint *restrict chunk_hits)
+                          global ulong *restrict chunk_tests, global ulong *restrict chunk_hits)
 {
     const uint n = *length;
-    uint tests = 0, hits = 0;
+    ulong tests = 0, hits = 0;
     for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {
         const uint node = pairs[i].x;
         const uint count = run_length(pairs, i, MIN(i + WIDTH, end));

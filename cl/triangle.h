@@ -6,7 +6,7 @@
 // these points; so a ray through a shared edge or vertex always hits one of the triangles there.
 // The paper falls back to double precision where an edge function is zero; a difference of products
 // by Kahan's method is within 1.5 ulp of the exact value of its float inputs, hence never zero or of
-// the wrong sign by rounding (Jeannerod, Louvet, Muller 2013), and needs no second precision.
+// the wrong sign by rounding (products of coordinates below 1e-19 underflow) (Jeannerod, Louvet, Muller 2013), and needs no second precision.
 //
 // The vector form does the same operations in the same order: hits are equal bit for bit.
 
@@ -58,16 +58,17 @@
     }                                                                                              \
                                                                                                    \
     /* The rest. A zero determinant (edge-on or zero-area) is a miss; comparisons with its NaN are \
-       false. + 0.0f turns -0.0 into 0.0, which sorts first among the bit patterns. */             \
+       false. + 0.0f turns -0.0 into 0.0, which sorts first among the bit patterns. Weights before \
+       depths: edges times depths would leave the range of float in large and tiny scenes. */      \
     inline TriangleHit##SUFFIX finish_hit##SUFFIX(const RayFrame##SUFFIX *r, I inside,             \
                                                   const F *edges, const F *depths)                 \
     {                                                                                              \
         TriangleHit##SUFFIX h;                                                                     \
         const F det = edges[0] + edges[1] + edges[2];                                              \
-        h.t = (edges[0] * depths[0] + edges[1] * depths[1] + edges[2] * depths[2]) / det + 0.0f;   \
         h.u = edges[1] / det;                                                                      \
         h.v = edges[2] / det;                                                                      \
-        h.hit = inside & (det != 0.0f) & (h.t >= r->tnear) & (h.t <= r->tfar);                     \
+        h.t = edges[0] / det * depths[0] + h.u * depths[1] + h.v * depths[2] + 0.0f;               \
+        h.hit = inside & (det != 0.0f) & (h.t >= r->tnear) & (h.t <= r->tfar) & (h.t < INFINITY);  \
         return h;                                                                                  \
     }
 
@@ -109,3 +110,9 @@ inline TriangleHit intersect_triangle(const RayFrame *r, global const float4 *tr
     }
     return finish_hit(r, inside, edges, depths);
 }
+
+// The closest hit of a ray is the 64-bit minimum over (bits of t, triangle): t >= 0, so its bits sort
+// like its value, and equal distances go to the smaller triangle, whatever the order of work.
+#define MISS 0xffffffffffffffffUL
+
+inline ulong hit_key(float t, uint triangle) { return ((ulong)as_uint(t) << 32) | triangle; }

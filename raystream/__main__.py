@@ -1,9 +1,11 @@
 """Command line: ``raystream render | compare | devices``."""
 
 import argparse
+import inspect
 import pathlib
 import sys
 
+import pyopencl as cl
 from tqdm import tqdm
 
 from raystream import image as images
@@ -11,7 +13,7 @@ from raystream import scenes
 from raystream._version import __version__
 from raystream.camera import Camera
 from raystream.device import default_device, devices
-from raystream.errors import BuildError, DeviceError, MemoryLimitError
+from raystream.errors import BuildError, DeviceError
 from raystream.light import PointLight
 from raystream.renderer import Renderer
 from raystream.scene import load_scene
@@ -29,7 +31,7 @@ PROCEDURAL = {
 }
 _VECTOR_OPTIONS = ("--eye", "--target", "--up", "--light", "--mirror-ball")
 _BAD_INPUT = 2
-_EXPECTED = (ValueError, TypeError, OSError, DeviceError, BuildError, MemoryLimitError)
+_EXPECTED = (ValueError, TypeError, OSError, DeviceError, BuildError, MemoryError, cl.Error)
 
 _SCENE_HELP = (
     "a file that trimesh reads (OBJ, PLY, STL, OFF, GLB, ...) or a procedural scene: "
@@ -54,7 +56,7 @@ def main(arguments=None):
     try:
         return options.run(options)
     except _EXPECTED as error:
-        print(f"raystream: {error}", file=sys.stderr)
+        print(f"raystream: {str(error).splitlines()[0]}", file=sys.stderr)
         return _BAD_INPUT
 
 
@@ -69,8 +71,14 @@ def _joined(arguments):
     return joined
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        """One line, without the usage."""
+        self.exit(_BAD_INPUT, f"{self.prog}: {message}\n")
+
+
 def _parser():
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="raystream", description="Ray queries and Whitted rendering in OpenCL."
     )
     parser.add_argument("--version", action="version", version=__version__)
@@ -186,6 +194,8 @@ def _load(options):
     if name in PROCEDURAL and not pathlib.Path(options.scene).is_file():
         if not argument:
             return PROCEDURAL[name]()
+        if not inspect.signature(PROCEDURAL[name]).parameters:
+            raise ValueError(f"{options.scene}: scene {name!r} takes no argument")
         return PROCEDURAL[name](int(argument) if argument.isdigit() else argument)
     return load_scene(options.scene, smooth=options.smooth, on_invalid=options.on_invalid)
 
@@ -205,7 +215,9 @@ def _camera(options, scene):
 
 
 def _render(options):
-    images.check_suffix(options.output)
+    path = images.check_suffix(options.output)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder")
     scene = _scene(options)
     camera = _camera(options, scene)
     renderer = Renderer(scene, options.method)
@@ -228,10 +240,10 @@ def _compare(options):
     names = [name.strip() for name in options.methods.split(",") if name.strip()]
     from raystream.compare import EMBREE
 
-    for name in names:
-        if name not in (*methods(), EMBREE):
-            listed = ", ".join((*methods(), EMBREE))
-            raise ValueError(f"--methods: need some of {listed}, got {name!r}")
+    known = (*methods(), EMBREE)
+    for name in names or [options.methods]:
+        if name not in known:
+            raise ValueError(f"--methods: need some of {', '.join(known)}, got {name!r}")
     scene = _scene(options)
     return _report(names, options, scene, _camera(options, scene), options.output)
 

@@ -37,7 +37,7 @@ def check_rows(name, wanted, good):
 
 def check_choice(name, value, choices):
     """Raise a ValueError with the list of `choices` unless `value` is one of them."""
-    if value not in choices:
+    if not any(type(value) is type(choice) and value == choice for choice in choices):
         listed = ", ".join(repr(c) for c in choices)
         raise ValueError(f"{name}: need one of {listed}, got {value!r}")
 

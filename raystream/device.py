@@ -65,8 +65,8 @@ def check_device(device):
     major, minor = (int(x) for x in device.version.split()[1].split("."))
     if (major, minor) < (1, 2):
         raise DeviceError(f"{device.name}: need OpenCL 1.2 or newer, got {device.version}")
-    if "cl_khr_int64_base_atomics" not in device.extensions:
-        raise DeviceError(f"{device.name}: need 64-bit atomics (cl_khr_int64_base_atomics)")
+    if "cl_khr_int64_extended_atomics" not in device.extensions:
+        raise DeviceError(f"{device.name}: need 64-bit atomics (cl_khr_int64_extended_atomics)")
     if pocl.is_pocl(device):
         pocl.name_target(device)
         failure = pocl.failure(device)
@@ -103,12 +103,37 @@ def session(device=None, context=None):
 
 
 def session_of(array):
-    """The session of this thread that works in the context of a device array."""
-    context = array.queue.context
+    """The session of this thread that works in the context and on the device of an array."""
+    queue = array.queue
+    if queue is None:
+        raise ValueError("device arrays: need arrays with a queue, got one without")
     for known in _thread.__dict__.get("sessions", {}).values():
-        if known.context == context:
+        if known.context == queue.context and known.device == queue.device:
             return known
-    return session(array.queue.device, context)
+    return session(queue.device, queue.context)
+
+
+def session_of_arrays(named):
+    """The session that the arrays of a call share; work that others queued on them is waited for.
+
+    Parameters
+    ----------
+    named : dict of str to pyopencl.array.Array
+        Arguments by name, the first decides.
+
+    Raises
+    ------
+    ValueError
+        An array has no queue or is of another context than the first.
+    """
+    shared = None
+    for name, array in named.items():
+        shared = session_of(array) if shared is None else shared
+        if array.queue is None or array.queue.context != shared.context:
+            raise ValueError(f"{name}: need an array of the same context as the others")
+        if array.queue != shared.queue:
+            array.queue.finish()
+    return shared
 
 
 class Session:

@@ -120,7 +120,9 @@ class RayHierarchy:
             origins, directions = rays
             rays = from_numpy(device.session(), origins, directions, 0.0, np.inf)
         session = device.session_of(rays.org_tnear)
-        return cls(session, rays, leaf_slots(session, rays), arity, levels)
+        hierarchy = cls(session, rays, leaf_slots(session, rays), arity, levels)
+        session.clock.forget()
+        return hierarchy
 
     def level(self, k):
         """The nodes of level `k`, 0 the rays, in the order of the hierarchy.
@@ -149,7 +151,7 @@ class RayHierarchy:
     def count_nodes(self):
         """Nodes per level that are not null, the rays first: a list, read from the device."""
         valid = [v.get() for v in self.valid[1:]]
-        return [int(valid[0].sum(dtype=np.uint64)), *(np.count_nonzero(v) for v in valid)]
+        return [int(valid[0].sum(dtype=np.uint64)), *(int(np.count_nonzero(v)) for v in valid)]
 
     def _padded(self, nodes):
         return -(-nodes // self.arity) * self.arity

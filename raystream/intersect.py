@@ -54,7 +54,7 @@ def not_blocked(session, count):
 
 def test_pairs(session, kernel, pairs, rays_per_node, slots, rays, triangles, result, traversal):
     """Run `kernel` ("intersect_pairs" or "occlude_pairs") over the last stream of a traversal."""
-    kernels = session.kernels("intersect.cl", CHUNKS=CHUNKS, ARITY=4)
+    kernels = session.kernels("intersect.cl", CHUNKS=CHUNKS)
     reduction = traversal.reduction
     session.launch(
         FINAL_INTERSECTION,
@@ -89,7 +89,7 @@ def resolve(session, closest, rays, triangles):
     hits = HitStream.empty(session, len(rays))
     session.launch(
         FINAL_INTERSECTION,
-        session.kernels("intersect.cl", CHUNKS=CHUNKS, ARITY=4)["resolve_hits"],
+        session.kernels("intersect.cl", CHUNKS=CHUNKS)["resolve_hits"],
         len(rays),
         np.uint32(len(rays)),
         closest,
@@ -111,7 +111,7 @@ def split_ids(session, hits, geometry):
     geom_id, prim_id = session.empty(count, np.int32), session.empty(count, np.int32)
     session.launch(
         FINAL_INTERSECTION,
-        session.kernels("intersect.cl", CHUNKS=CHUNKS, ARITY=4)["split_ids"],
+        session.kernels("intersect.cl", CHUNKS=CHUNKS)["split_ids"],
         count,
         np.uint32(count),
         hits.triangle,

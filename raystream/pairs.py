@@ -48,7 +48,7 @@ class Reduction:
 
     Attributes
     ----------
-    chunk_tests, chunk_hits : Array of shape (CHUNKS,) uint32
+    chunk_tests, chunk_hits : Array of shape (CHUNKS,) uint64
         What the producer counted per chunk.
     offsets : Array of shape (CHUNKS,) uint32
         Survivors before each chunk.
@@ -59,8 +59,8 @@ class Reduction:
     def __init__(self, session, arity):
         self.session, self.arity = session, arity
         self._kernels = session.kernels("pairs.cl", ARITY=arity, CHUNKS=CHUNKS)
-        self.chunk_tests = session.empty(CHUNKS, np.uint32)
-        self.chunk_hits = session.empty(CHUNKS, np.uint32)
+        self.chunk_tests = session.empty(CHUNKS, np.uint64)
+        self.chunk_hits = session.empty(CHUNKS, np.uint64)
         self.offsets = session.empty(CHUNKS, np.uint32)
         self.overflow = session.empty(1, np.uint64)
         session.fill(STREAM_REDUCTION, self.overflow, 0)

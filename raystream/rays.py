@@ -69,9 +69,11 @@ def _per_ray(name, value, count):
 
 def from_device(session, origins, directions, tnear, tfar):
     """Pack rays given as `pyopencl.array` arrays of the session's context; see `from_numpy`."""
-    count = origins.shape[0] if origins.ndim == 2 else -1
+    count = origins.shape[0]
+    if origins.ndim != 2 or origins.shape[1] != 3:
+        raise ValueError(f"origins: need shape (n, 3), got {origins.shape}")
     for name, array in (("origins", origins), ("directions", directions)):
-        _check_device_array(name, array, (count if count >= 0 else "n", 3))
+        _check_device_array(name, array, (count, 3))
     bounds = [_per_ray_on_device(session, *x, count) for x in (("tnear", tnear), ("tfar", tfar))]
     org_tnear = session.empty((count, 4), np.float32)
     dir_tfar = session.empty((count, 4), np.float32)

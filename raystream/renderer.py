@@ -110,6 +110,8 @@ class Renderer:
     def __init__(self, scene, method="rsh", device=None, **options):
         self.scene = as_scene(scene)
         self._tracer = _tracer(self.scene, method, device, options)
+        if device is None and isinstance(self._tracer, Tracer):
+            device = self._tracer.device
         self._session = devices.session(device)
         geometry = (
             self._tracer.geometry(self._session)
@@ -139,6 +141,7 @@ class Renderer:
         if isinstance(self._tracer, Tracer):
             self._tracer.geometry(self._session)  # takes vertices updated since the last frame
         statistics = Statistics(triangles=self.scene.num_triangles)
+        self._session.clock.forget()
         image = self._session.empty((width * height, 4), np.float32)
         self._session.fill(SHADING, image, 0)
         visible = None
@@ -148,10 +151,10 @@ class Renderer:
                 camera, (width, height), offset, max_bounces, shadows, image, statistics
             )
             visible = visible or self._visible(hits)
+            statistics.add(Statistics(stages=self._session.finish()))
             if progress is not None:
                 progress(sample + 1, samples)
         linear = image.get().reshape(height, width, 4)[..., :3] / np.float32(samples)
-        statistics.stages = self._session.finish()
         visible = [field.reshape(height, width) for field in visible]
         return Frame(np.ascontiguousarray(linear), *visible, statistics)
 

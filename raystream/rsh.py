@@ -18,6 +18,7 @@ from raystream.pairs import FUSED, LOADED, PAIR_BYTES, REDUCTIONS, bytes_per_pai
 from raystream.statistics import Statistics
 from raystream.traverse import Traversal
 
+_MOST_PAIRS = 1 << 31  # lengths and places are 32 bits
 _FIRST_PAIRS = 1 << 20  # streams start with room for this many pairs and grow up to the limit
 
 
@@ -57,9 +58,11 @@ class RayspaceTracer:
         self.session, self.geometry = session, geometry
         self._arity, self._levels, self._reduction = arity, levels, reduction
         self._limit, self._bytes_per_pair = memory_limit, bytes_per_pair(arity, reduction)
+        fused = reduction == FUSED
         self._most_pairs = min(
             memory_limit // self._bytes_per_pair,
-            session.device.max_mem_alloc_size // PAIR_BYTES - LOADED,
+            session.device.max_mem_alloc_size // (PAIR_BYTES * (1 if fused else arity)) - LOADED,
+            _MOST_PAIRS,
         )
         self._capacity = min(_FIRST_PAIRS, self._most_pairs)
 

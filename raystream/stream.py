@@ -47,7 +47,7 @@ def reduce(values, keep, method="segmented", segment_size=None):
         Names the argument, what was wanted and what came.
     """
     check_choice("method", method, METHODS)
-    size = check_count("segment_size", SEGMENT_SIZE if segment_size is None else segment_size)
+    size = _segment_size(segment_size)
     call = _Call(values=values, keep=keep)
     source, flags = call.words("values"), call.flags("keep", len(values))
     session = call.session
@@ -80,7 +80,7 @@ def reduce_segments(values, keep, segment_size=None):
     lengths : array of shape (number of segments,) uint32
         How many they are.
     """
-    size = check_count("segment_size", SEGMENT_SIZE if segment_size is None else segment_size)
+    size = _segment_size(segment_size)
     call = _Call(values=values, keep=keep)
     source, flags = call.words("values"), call.flags("keep", len(values))
     segments = call.session.empty(source.shape, source.dtype)
@@ -169,6 +169,10 @@ def sort_by_key(keys, values=None, bits=None):
     return call.result(keys_out), call.result(values_out).view(_dtype(values))
 
 
+def _segment_size(given):
+    return SEGMENT_SIZE if given is None else min(check_count("segment_size", given), _MOST)
+
+
 def _walks_chunks(session):
     return bool(session.device.type & cl.device_type.CPU)
 
@@ -183,12 +187,13 @@ class _Call:
         self.on_device = kinds == {True}
         self._named = named
         first = next(iter(named.values()))
-        self.session = devices.session_of(first) if self.on_device else devices.session()
-        self._foreign = self.on_device and first.queue != self.session.queue
-        if self._foreign:
-            first.queue.finish()  # its work must be done before ours begins, and ours before its
         for name, array in named.items():
             _check_length(name, array)
+        self.session = (
+            devices.session_of_arrays(named) if self.on_device else devices.session()
+        )
+        # Our work must be done before theirs goes on.
+        self._foreign = self.on_device and first.queue != self.session.queue
 
     def words(self, name):
         """Elements as they are on the device, as rows of uint32 from numpy."""
@@ -251,6 +256,8 @@ class _Call:
 def _check_length(name, array):
     if not isinstance(array, (np.ndarray, cla.Array)):
         raise TypeError(f"{name}: need a numpy or pyopencl array, got {type(array).__name__}")
+    if not np.dtype(array.dtype).isnative:
+        raise TypeError(f"{name}: need the machine's byte order, got dtype {array.dtype}")
     if array.ndim == 0 or array.shape[0] > _MOST:
         raise ValueError(f"{name}: need 0 to {_MOST} elements, got shape {array.shape}")
 
@@ -270,8 +277,6 @@ def _element_bytes(name, array):
 
 def _dtype(array):
     return np.dtype(array.dtype)
-
-
 
 
 def _like(array, values):

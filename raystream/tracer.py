@@ -1,7 +1,9 @@
 """`Tracer`: ray queries against a scene, by any of the methods."""
 
+import copy
 import dataclasses
 import inspect
+import weakref
 
 import numpy as np
 import pyopencl.array as cla
@@ -36,7 +38,8 @@ class Hits:
     t : (n,) float32
         In units of the direction's length, inf where missed.
     prim_id, geom_id : (n,) int32
-        Face within its mesh and mesh within the scene, -1 where missed.
+        Face within its mesh and mesh within the scene, -1 where missed. Where loading dropped
+        invalid faces, `Mesh.face_ids` maps prim_id to the face of the file.
     u, v : (n,) float32
         The hit point is (1 - u - v) v0 + u v1 + v v2; 0 where missed.
     """
@@ -83,12 +86,13 @@ class Tracer:
         _check_options(method, options)
         if memory_limit is not None:
             check_count("memory_limit", memory_limit)
-        self.scene = as_scene(scene)
+        self.scene = copy.copy(as_scene(scene))  # what is added to the scene later is not traced
         self.method = method
         self.statistics = Statistics(triangles=self.scene.num_triangles)
-        self._device, self._memory_limit, self._options = device, memory_limit, options
+        self.device, self._memory_limit, self._options = device, memory_limit, options
         self._vertices, self._version = self.scene.vertices, 0
-        self._backends = {}  # per session: version of the vertices, geometry, method
+        self._used = np.zeros(len(self._vertices), bool)
+        self._used[self.scene.faces] = True
         self._backend(devices.session(device))
 
     def intersect(self, origins, directions, tnear=0.0, tfar=np.inf):
@@ -146,9 +150,13 @@ class Tracer:
         ValueError
             Another shape, or values that are not finite.
         """
+        if isinstance(vertices, cla.Array):
+            raise TypeError("vertices: need a numpy array, got one on the device")
         vertices = as_float_array("vertices", vertices, self._vertices.shape)
-        check_rows("vertices", "finite values", np.isfinite(vertices).all(axis=1))
-        self._vertices, self._version = vertices, self._version + 1
+        # Vertices that no face uses may hold anything, as in a mesh.
+        finite = np.isfinite(vertices).all(axis=1) | ~self._used
+        check_rows("vertices", "finite values", finite)
+        self._vertices, self._version = vertices.copy(), self._version + 1
 
     def geometry(self, session):
         """The scene's `Geometry` on a session's device, with the vertices of the last update."""
@@ -175,22 +183,26 @@ class Tracer:
 
     def _rays(self, on_device, origins, directions, tnear, tfar):
         """The session to work in and the packed rays; a caller's context is worked in directly."""
-        if on_device:
-            session = devices.session_of(origins)
-            origins.queue.finish()  # the caller's queue is not ours: its work must be done
-            return session, rays.from_device(session, origins, directions, tnear, tfar)
-        session = devices.session(self._device)
-        return session, rays.from_numpy(session, origins, directions, tnear, tfar)
+        arguments = {"origins": origins, "directions": directions, "tnear": tnear, "tfar": tfar}
+        given = {name: a for name, a in arguments.items() if isinstance(a, cla.Array)}
+        if given and not on_device:
+            raise TypeError(f"{next(iter(given))}: need a numpy array like the origins")
+        session = devices.session_of_arrays(given) if on_device else devices.session(self.device)
+        session.clock.forget()
+        make = rays.from_device if on_device else rays.from_numpy
+        return session, make(session, **arguments)
 
     def _backend(self, session):
-        backend = self._backends.get(session)
+        # The session holds its backends, so those of an ended thread go with it.
+        backends = session.cache.setdefault("backends", weakref.WeakKeyDictionary())
+        backend = backends.get(self)
         if backend is None:
             geometry = Geometry(session, self.scene)
             limit = self._memory_limit or min(
                 session.device.global_mem_size // _MEMORY_SHARE, _MOST_MEMORY
             )
             method = _METHODS[self.method](session, geometry, limit, **self._options)
-            backend = self._backends[session] = _Backend(geometry, method, version=0)
+            backend = backends[self] = _Backend(geometry, method, version=0)
         if backend.version != self._version:
             backend.geometry.update(self._vertices)
             backend.version = self._version

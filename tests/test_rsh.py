@@ -180,3 +180,42 @@ def test_equal_distances_go_to_the_smaller_number():
         hits = rs.Tracer(scene, method).intersect(origins, [[0, 0, -1]] * 70)
         assert set(hits.geom_id) == {1} and set(hits.prim_id) == {1}
         assert set(hits.t) == {0.5}
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-8, 1e-4, 1e4, 1e8, 1e12])
+def test_scenes_of_any_size(scale):
+    import trimesh
+
+    ball = trimesh.creation.icosphere(2)
+    ball.apply_scale(scale)
+    directions = np.random.default_rng(8).normal(size=(500, 3))
+    rays = np.zeros((500, 3)), directions
+    tracers = [rs.Tracer(ball, method) for method in ("rsh", "brute")]
+    ours, theirs = (tracer.intersect(*rays) for tracer in tracers)
+    assert_same_hits(ours, theirs)
+    assert (ours.prim_id >= 0).all()
+    assert tracers[0].statistics.final_hits == tracers[1].statistics.final_hits
+    length = ours.t * np.linalg.norm(directions, axis=1)
+    assert (length > 0.9 * scale).all() and (length < 1.01 * scale).all()
+
+
+def test_origins_far_apart_lose_nothing(rng):
+    scene = triangle_soup(rng, 200, size=0.6)
+    origins, directions = random_rays(rng, 200, spread=0.3)
+    origins[::16] = [-3e19, 0, 3e19]
+    assert_nothing_lost(scene, origins, directions)
+
+
+def test_a_huge_direction_with_no_length_left():
+    corner = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+    scene = rs.Scene([mesh_of("corner", corner)])
+    origins, directions = np.zeros((5, 3)), np.full((5, 3), 3e38)
+    assert_nothing_lost(scene, origins, directions, tfar=0.0)
+
+
+def test_statistics_are_plain_objects(rng):
+    import json
+
+    tracer = rs.Tracer(triangle_soup(rng, 50))
+    tracer.intersect(*random_rays(rng, 100))
+    assert json.loads(json.dumps(tracer.statistics.to_dict())) == tracer.statistics.to_dict()

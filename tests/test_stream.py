@@ -259,6 +259,7 @@ YES = np.ones(4, bool)
     (lambda: stream.sort_by_key(N, N[1:]), ValueError, r"values: need shape \(4,\)"),
     (lambda: stream.sort_by_key(N, N.astype(np.uint8)), TypeError, "values: need elements of 4 or"),
     (lambda: stream.sort_by_key(N, bits=33), ValueError, "bits: need at most 32"),
+    (lambda: stream.sort_by_key(N.astype(">u4")), TypeError, "keys: need the machine's byte order"),
 ])  # fmt: skip
 def test_bad_input_is_refused(call, error, message):
     with pytest.raises(error, match=message):

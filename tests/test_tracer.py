@@ -243,3 +243,61 @@ def test_embree_agrees_on_a_large_soup(rng, method):
     hits = rs.Tracer(scene, method).intersect(*rays)
     agreement = differing(hits, EmbreeTracer.from_scene(scene).intersect(*rays), *triangles, *rays)
     assert agreement.num_wrong == 0, agreement
+
+
+def test_the_callers_array_may_change_after_an_update(rng):
+    scene = triangle_soup(rng, 100)
+    tracer, rays = rs.Tracer(scene), random_rays(rng, 300)
+    expected = tracer.intersect(*rays)
+    vertices = scene.vertices.copy()
+    tracer.update_vertices(vertices)
+    vertices += 100
+    np.testing.assert_array_equal(tracer.intersect(*rays).t, expected.t)
+
+
+def test_vertices_that_no_face_uses_may_hold_anything():
+    corners = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [np.nan, 0, 0]])
+    tracer = rs.Tracer(rs.Scene([rs.Mesh(corners, [[0, 1, 2]])]))
+    tracer.update_vertices(corners + 1)
+    assert tracer.intersect([[1.2, 1.2, 0]], [[0, 0, 1]]).t[0] == 2
+
+
+def test_a_mesh_added_to_the_scene_later_is_not_traced(rng):
+    scene = triangle_soup(rng, 20)
+    tracer, rays = rs.Tracer(scene), random_rays(rng, 200)
+    expected = tracer.intersect(*rays)
+    scene.add(rs.scenes.mirror_ball((0.5, 0.5, 0.5), 5.0))
+    np.testing.assert_array_equal(tracer.intersect(*rays).t, expected.t)
+    assert tracer.statistics.triangles == 20
+
+
+def test_a_finished_thread_leaves_nothing_behind(rng):
+    import gc
+    import weakref
+
+    from raystream import device
+
+    tracer, rays, seen = rs.Tracer(triangle_soup(rng, 20)), random_rays(rng, 50), []
+
+    def work():
+        tracer.intersect(*rays)
+        seen.append(weakref.ref(device.session()))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    gc.collect()
+    assert seen[0]() is None
+
+
+def test_arrays_of_two_contexts_or_none_are_refused(session):
+    other = cl.CommandQueue(cl.Context([session.device]))
+    tracer = rs.Tracer(trimesh.creation.box())
+    origins = cla.to_device(session.queue, np.zeros((2, 3), np.float32))
+    directions = cla.to_device(other, np.ones((2, 3), np.float32))
+    with pytest.raises(ValueError, match="directions: need an array of the same context"):
+        tracer.intersect(origins, directions)
+    with pytest.raises(ValueError, match="need arrays with a queue"):
+        tracer.intersect(origins.with_queue(None), directions)
+    with pytest.raises(TypeError, match="directions: need a numpy array like the origins"):
+        tracer.intersect(np.zeros((2, 3)), directions)

@@ -116,7 +116,8 @@ def compare_reductions(name, scene, camera):
     for reduction in REDUCTIONS:
         renderer = rs.Renderer(scene, "rsh", reduction=reduction)
         renderer.render(camera, SIZE)
-        frames = [timed_frame(renderer, camera) for _ in range(1 if reduction in ("horn", "append") else 3)]
+        runs = 1 if reduction == "horn" else 3
+        frames = [timed_frame(renderer, camera) for _ in range(runs)]
         seconds, frame = min(frames, key=lambda pair: pair[0])
         fused = fused or seconds
         stages = frame.statistics.stages

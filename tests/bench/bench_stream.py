@@ -42,6 +42,7 @@ class Bench:
         self.session = device.session()
         self.queue = self.session.queue
         self.rng = np.random.default_rng(16)
+        self.copy_arrays = [self.filled((count, 2), np.uint32) for _ in range(2)]
         self.copy_kernel = cl.Kernel(cl.Program(self.session.context, COPY).build(), "copy_words")
 
     def median(self, run, runs=7):
@@ -64,11 +65,20 @@ class Bench:
 
     def copy_speed(self):
         """Bytes per second, read and written, of a plain copy of `count` pairs."""
-        source, target = (self.filled((self.count, 2), np.uint32) for _ in range(2))
-        words = np.uint64(source.nbytes // 64)
-        args = (words, source.data, target.data)
-        seconds = self.median(lambda: self.copy_kernel(self.queue, (64,), (1,), *args))
+        source, target = self.copy_arrays
+        args = np.uint64(source.nbytes // 64), source.data, target.data
+        seconds = self.median(lambda: self.copy_kernel(self.queue, (64,), (1,), *args), 5)
         return 2 * source.nbytes / seconds
+
+    def beside_copy(self, figures):
+        """Each (name, figure) with its ratio to a copy measured just before: machines drift."""
+        figures = iter(figures)
+        while True:
+            copy = self.copy_speed()
+            following = next(figures, None)
+            if following is None:
+                return
+            yield *following, following[1] / copy
 
 
 def reductions(bench, share):
@@ -211,26 +221,26 @@ def test_sort(benchmark, bench, count):
 
 
 def measure(lengths):
-    """Rows (operation, length, method, figure, share of copy or None)."""
+    """Rows (operation, length, method, figure, its ratio to the copy)."""
     rows = []
     for count in tqdm(lengths, disable=None):
         bench = Bench(count)
-        copy = bench.copy_speed()
-        rows.append(("copy", count, "plain copy kernel", copy, 1.0))
+        rows.append(("copy", count, "plain copy kernel", bench.copy_speed(), 1.0))
         for share in SHARES:
-            for name, speed in reductions(bench, share):
-                rows.append((f"reduce, {share:.0%} survive", count, name, speed, speed / copy))
-        for name, speed in scans(bench):
-            rows.append(("scan", count, name, speed, speed / copy))
-        for name, speed in sorts(bench):
-            rows.append(("sort", count, name, speed, None))
+            for figures in bench.beside_copy(reductions(bench, share)):
+                rows.append((f"reduce, {share:.0%} survive", count, *figures))
+        rows += [("scan", count, *figures) for figures in bench.beside_copy(scans(bench))]
+        rows += [("sort", count, *figures) for figures in bench.beside_copy(sorts(bench))]
     return rows
 
 
 def show(rows):
     for operation, count, name, figure, share in rows:
-        speed = f"{figure / 1e9:6.2f} GB/s {share:6.0%} of copy" if share else ""
-        print(f"{operation:22} {count:>9} {name:26} {speed or f'{figure / 1e6:6.0f} M/s'}")
+        if operation == "sort":
+            speed = f"{figure / 1e6:6.0f} M/s, {1e3 * share:.1f} M/s for each GB/s of copy"
+        else:
+            speed = f"{figure / 1e9:6.2f} GB/s {share:6.0%} of copy"
+        print(f"{operation:22} {count:>9} {name:26} {speed}")
 
 
 def plot(rows, path):
