@@ -27,7 +27,13 @@
 #define SLACK 0x1p-19f
 #define NULL_REACH (-INFINITY)
 
-inline float16 magnitude(float16 x) { return x < 0.0f ? -x : x; }
+inline float16 magnitude(float16 x) { return as_float16(as_int16(x) & 0x7fffffff); }
+
+// Fused, so with fewer roundings than the bound above allows for, and a third fewer instructions.
+inline float16 dot16(float16 ax, float16 ay, float16 az, float16 bx, float16 by, float16 bz)
+{
+    return FMA16(ax, bx, FMA16(ay, by, az * bz));
+}
 
 // Lane by lane; the arguments are the node's fields in the order of its rows, then P and d.
 inline int16 node_meets_sphere(float16 cx, float16 cy, float16 cz, float16 r, float16 ax, float16 ay,
@@ -35,13 +41,15 @@ inline int16 node_meets_sphere(float16 cx, float16 cy, float16 cz, float16 r, fl
                                float16 py, float16 pz, float16 d)
 {
     const float16 wx = px - cx, wy = py - cy, wz = pz - cz;
-    const float16 s = r + d + SLACK * (magnitude(wx) + magnitude(wy) + magnitude(wz));
-    const float16 h = wx * ax + wy * ay + wz * az;
-    const float16 kx = wy * az - wz * ay, ky = wz * ax - wx * az, kz = wx * ay - wy * ax;
-    const float16 p2 = kx * kx + ky * ky + kz * kz;
-    const float16 q = h * sine + s;
+    const float16 s
+        = FMA16((float16)SLACK, magnitude(wx) + magnitude(wy) + magnitude(wz), r + d);
+    const float16 h = dot16(wx, wy, wz, ax, ay, az);
+    const float16 kx = FMA16(wy, az, -(wz * ay)), ky = FMA16(wz, ax, -(wx * az)),
+                  kz = FMA16(wx, ay, -(wy * ax));
+    const float16 p2 = dot16(kx, ky, kz, kx, ky, kz);
+    const float16 q = FMA16(h, sine, s);
     const float16 far = reach + s;
     const int16 in_cone = (q >= 0.0f) & (p2 * cosine * cosine <= q * q) & (h >= -s);
-    const int16 in_reach = (far >= 0.0f) & (wx * wx + wy * wy + wz * wz <= far * far);
+    const int16 in_reach = (far >= 0.0f) & (dot16(wx, wy, wz, wx, wy, wz) <= far * far);
     return in_reach & (in_cone | (cosine <= 0.0f));
 }

@@ -68,7 +68,7 @@
         h.u = edges[1] / det;                                                                      \
         h.v = edges[2] / det;                                                                      \
         h.t = edges[0] / det * depths[0] + h.u * depths[1] + h.v * depths[2] + 0.0f;               \
-        h.hit = inside & (det != 0.0f) & (h.t >= r->tnear) & (h.t <= r->tfar) & (h.t < INFINITY);  \
+        h.hit = inside & (det != 0.0f) & (h.t >= r->tnear) & (h.t <= r->tfar);                     \
         return h;                                                                                  \
     }
 
@@ -82,7 +82,9 @@ inline RayFrame ray_frame(float4 org_tnear, float4 dir_tfar)
     const float ax = d.x < 0.0f ? -d.x : d.x;
     const float ay = d.y < 0.0f ? -d.y : d.y;
     const float az = d.z < 0.0f ? -d.z : d.z;
-    RayFrame r = {org_tnear.x, org_tnear.y, org_tnear.z, 0, 0, 0, 0, 0, 0, 0, 0, 0, org_tnear.w, d.w};
+    // A distance that leaves the range of float is no hit: infinity stays above tfar.
+    const float tfar = MIN(d.w, MAXFLOAT);
+    RayFrame r = {org_tnear.x, org_tnear.y, org_tnear.z, 0, 0, 0, 0, 0, 0, 0, 0, 0, org_tnear.w, tfar};
     // The major axis is the largest component, so the shears are at most one in size.
     if (ax >= ay && ax >= az) {
         r.y0 = 1.0f, r.x0 = -(d.y / d.x);

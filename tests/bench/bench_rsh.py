@@ -75,9 +75,15 @@ def test_frame_of_the_demo_scene(benchmark):
     benchmark(renderer.render, size=SIZE)
 
 
-def median_time(tracer, stream, runs):
-    trace(tracer, stream)
-    return mean.median(trace(tracer, stream)[0] for _ in range(runs))
+def in_turn(first, second, stream, rounds=5):
+    """Seconds of both tracers, one after the other in every round: the machine's speed drifts."""
+    for tracer in (first, second):
+        trace(tracer, stream)
+    pairs = [
+        (mean.median(trace(first, stream)[0] for _ in range(3)), trace(second, stream)[0])
+        for _ in range(rounds)
+    ]
+    return [list(column) for column in zip(*pairs, strict=True)]
 
 
 def main():
@@ -87,11 +93,12 @@ def main():
     for real in (BUNNY, PATIO):
         scene, stream = reflection_rays(real, folder)
         tracer = rs.Tracer(scene, "rsh")
-        rsh = median_time(tracer, stream, 9)
-        brute = median_time(rs.Tracer(scene, "brute"), stream, 3)
+        rsh, brute = in_turn(tracer, rs.Tracer(scene, "brute"), stream)
         _, counts, stages = trace(tracer, stream)
         print(f"{real.name}: {counts.rays} reflection rays, {scene.num_triangles} triangles")
-        print(f"  rsh {rsh * 1e3:.1f} ms, brute {brute * 1e3:.0f} ms: {brute / rsh:.0f} times")
+        ratio = mean.median(b / r for r, b in zip(rsh, brute, strict=True))
+        times = f"rsh {mean.median(rsh) * 1e3:.1f} ms, brute {mean.median(brute) * 1e3:.0f} ms"
+        print(f"  {times}; median of {len(rsh)} ratios, in turn: {ratio:.1f}")
         left = counts.final_tests / counts.rays
         print(f"  triangles left per ray after the last level: {left:.2f}")
         total = sum(s["wall"] for s in stages.values())
