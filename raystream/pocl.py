@@ -15,6 +15,7 @@ Two faults of the PoCL 3.0 wheel end a process or stop every build; Python canno
 Run as a script (``python pocl.py PLATFORM DEVICE``) this file is the check itself.
 """
 
+import contextlib
 import ctypes
 import hashlib
 import os
@@ -130,11 +131,10 @@ def _marker(device):
 
 
 def _remember(marker):
-    try:
+    # In a read-only home the next process checks again; nothing is lost.
+    with contextlib.suppress(OSError):
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
-    except OSError:
-        pass  # a read-only home: the next process checks again, nothing is lost
 
 
 def _check_in_child(device):
