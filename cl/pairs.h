@@ -8,7 +8,7 @@
 // together, a *run*. A run shares its node, so a pass works on one node and up to sixteen triangles at
 // a time. Survivors of a pass are a mask per pair: bit c for child c.
 //
-// Build-time constants: CHUNKS, ARITY.
+// Build-time constant: CHUNKS.
 
 #include "common.h"
 

@@ -1,28 +1,19 @@
 """Primary visibility: a float64 oracle, closed surfaces without holes, Embree's primary rays."""
 
-import os
 import pathlib
 
 import numpy as np
 import pyopencl as cl
 import pytest
+from meshes import FOLDER, needs_files
 
-from raystream import device, program, rasterize
+from raystream import program, rasterize
 from raystream.camera import Camera
 from raystream.rasterize import Rasterizer
 
 INVALID = 0xFFFFFFFF
 EDGE = 1e-3  # pixels from an edge within which float32 and float64 may disagree
 ROUNDING = 2e-6  # of positions, relative to the triangle's farthest coordinate from the eye
-SCENES = os.environ.get("RAYSTREAM_SCENES")
-needs_scenes = pytest.mark.skipif(
-    not SCENES, reason="RAYSTREAM_SCENES does not name the folder of test scenes"
-)
-
-
-@pytest.fixture(scope="module")
-def session():
-    return device.session()
 
 
 @pytest.fixture
@@ -334,7 +325,7 @@ def test_wrong_arrays_are_refused(session, rasterizer):
         rasterizer.render(one, camera, (4, 4), num_triangles=2)
 
 
-@needs_scenes
+@needs_files
 @pytest.mark.parametrize(
     ("file", "eye", "direction", "fov_y"),
     [
@@ -346,7 +337,7 @@ def test_embree_meets_the_same_triangles(rasterizer, file, eye, direction, fov_y
     trimesh = pytest.importorskip("trimesh")
     from raystream.baselines import EmbreeTracer
 
-    path = pathlib.Path(SCENES, file)
+    path = pathlib.Path(FOLDER, file)
     if not path.exists():
         pytest.skip(f"RAYSTREAM_SCENES has no {file}")
     mesh = trimesh.load(path, process=False, force="mesh")
