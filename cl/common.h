@@ -25,7 +25,10 @@ inline float4 cross3(float4 a, float4 b)
 }
 
 #ifdef CHUNKS
-// Chunk of this work-item in a stream of n elements that CHUNKS of them share: first, and last + 1.
-inline ulong chunk_begin(ulong n) { return get_global_id(0) * n / CHUNKS; }
-inline ulong chunk_end(ulong n) { return (get_global_id(0) + 1) * n / CHUNKS; }
+// First element of a chunk, where CHUNKS of them share a stream of n elements.
+inline ulong chunk_first(ulong chunk, ulong n) { return chunk * n / CHUNKS; }
+
+// Chunk of this work-item: first, and last + 1.
+inline ulong chunk_begin(ulong n) { return chunk_first(get_global_id(0), n); }
+inline ulong chunk_end(ulong n) { return chunk_first(get_global_id(0) + 1, n); }
 #endif

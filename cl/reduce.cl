@@ -20,8 +20,19 @@
 inline ulong count_range(global const uchar *keep, ulong begin, ulong end)
 {
     ulong count = 0;
+#ifdef COMPRESS16
     for (; begin + 64 <= end; begin += 64)
         count += COUNT64(NONZERO64(keep + begin));
+#else
+    for (; begin < end && ((ulong)(keep + begin) & 7) != 0; begin++)
+        count += keep[begin] != 0;
+    for (; begin + 8 <= end; begin += 8) {
+        const ulong low = 0x7f7f7f7f7f7f7f7ful, bytes = *(global const ulong *)(keep + begin);
+        // The top bit of each byte says whether the byte is not 0; the product sums the bytes.
+        const ulong nonzero = (((bytes & low) + low) | bytes) & ~low;
+        count += ((nonzero >> 7) * 0x0101010101010101ul) >> 56;
+    }
+#endif
     for (; begin < end; begin++)
         count += keep[begin] != 0;
     return count;
@@ -55,9 +66,10 @@ inline void compact_range(global const ELEMENT *values, global const uchar *keep
         out += COUNT64(mask);
     }
 #endif
-    for (; begin < end; begin++) {
-        if (keep[begin])
-            *out++ = values[begin];
+    // Without a branch: what is not kept is overwritten by the next one that is.
+    for (; begin < end && out < stop; begin++) {
+        *out = values[begin];
+        out += keep[begin] != 0;
     }
 }
 

@@ -167,22 +167,29 @@ class Session:
         """Run `kernel` over `size` work-items in groups of `local`, timed under `stage`.
 
         `size` is rounded up to whole groups (a prime size is three times slower otherwise), so
-        kernels guard their index. Arrays are passed as their buffers. A size of 0 launches nothing.
+        kernels guard their index. Arrays are passed as their buffers, None stands for one that the
+        kernel does not touch. A size of 0 launches nothing.
         """
         if size == 0:
             return
-        buffers = [self._buffer(a) if isinstance(a, cl.array.Array) else a for a in args]
+        buffers = [self._buffer(a) for a in args]
         rounded = -(-size // local) * local
         self.clock.record(stage, kernel(self.queue, (rounded,), (local,), *buffers))
+
+    def exceeds_cache(self, nbytes):
+        """Whether a stream of so many bytes has left the device's cache before it is read again."""
+        return nbytes > self.device.global_mem_cache_size
 
     def trim(self):
         """Give the memory back that the pool holds and no array uses."""
         self.queue.finish()
         self.pool.free_held()
 
-    def _buffer(self, array):
+    def _buffer(self, argument):
         # An empty array has no buffer, and PoCL ends the process where a kernel's argument is null.
-        return array.data if array.size else self._nothing
+        if isinstance(argument, cl.array.Array):
+            return argument.data if argument.size else self._nothing
+        return self._nothing if argument is None else argument
 
     def empty(self, shape, dtype):
         """An uninitialised device array from the pool.

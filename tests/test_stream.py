@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from raystream import device, scan, sort, stream
 from raystream import reduce as reduction
-from raystream import stream
 
 LENGTHS = [0, 1, 2, 15, 16, 17, 63, 64, 65, 127, 128, 129, 1000, 4095, 4096, 4097, 10_007, 65_537]
 LARGE = 2**24 + 1
@@ -193,6 +193,71 @@ def test_any_keys(keys, bits):
     keys = np.array(keys, np.uint64)
     order = np.argsort(keys & np.uint64(2**bits - 1), kind="stable")
     np.testing.assert_array_equal(stream.sort_by_key(keys, bits=bits)[0], keys[order])
+
+
+# --- streams larger than the cache ---
+
+
+@pytest.fixture
+def no_cache(monkeypatch):
+    """Short streams take the path of those that no cache holds."""
+    monkeypatch.setattr(device.Session, "exceeds_cache", lambda _session, nbytes: nbytes > 0)
+
+
+def test_scan_past_the_cache(no_cache, rng):
+    test_scans_equal_cumsum(np.uint32, rng)
+    on_device = device.session().upload("x", np.arange(10_007, dtype=np.uint32))
+    scan.scan(device.session(), on_device, on_device)  # in place
+    expected = np.cumsum(np.arange(10_007)) - np.arange(10_007)
+    np.testing.assert_array_equal(on_device.get(), expected)
+
+
+@pytest.mark.parametrize("key", [np.uint32, np.uint64])
+@pytest.mark.parametrize("value", [None, np.uint32, np.float64])
+def test_buffered_sort(no_cache, key, value, rng):
+    test_sort_is_stable_and_ascending(key, value, rng)
+
+
+@pytest.mark.parametrize("bits", [1, 11, 12, 23, 32])
+def test_buffered_sort_of_the_lowest_bits(no_cache, bits, rng):
+    test_only_the_lowest_bits_count(bits, rng)
+
+
+BEYOND = 2**29 + 77  # 32-bit elements: more than 2^31 bytes
+
+
+@pytest.fixture
+def huge(session):
+    """A session whose device takes buffers beyond 2^31 bytes, with memory for five of them."""
+    needed = 5 * 4 * BEYOND
+    if session.device.max_mem_alloc_size < 4 * BEYOND or session.device.global_mem_size < needed:
+        pytest.skip(f"needs buffers of {4 * BEYOND} bytes and {needed} bytes of device memory")
+    yield session
+    session.trim()
+
+
+def test_scan_and_reduction_beyond_2_to_31_bytes(huge):
+    values, out = (huge.empty(BEYOND, np.uint32) for _ in range(2))
+    huge.fill("x", values, 3)
+    scan.scan(huge, values, out)
+    tail = out[2**29 - 16 :].get()
+    np.testing.assert_array_equal(tail, 3 * np.arange(2**29 - 16, BEYOND, dtype=np.uint32))
+    keep, total = huge.empty(BEYOND, np.uint8), huge.empty(1, np.uint32)
+    huge.fill("x", keep, 0)
+    keep[BEYOND - 77 :] = np.ones(77, np.uint8)
+    reduction.Reducer(huge, 4).reduce("scan", BEYOND, out, keep, values, total, 4096)
+    assert total.get().tolist() == [77]
+    np.testing.assert_array_equal(values[:77].get(), tail[-77:])
+
+
+def test_sort_beyond_2_to_31_bytes(huge):
+    keys = huge.empty(BEYOND, np.uint32)
+    huge.fill("x", keys, 2)
+    keys[BEYOND - 77 :] = np.tile(np.arange(7, dtype=np.uint32), 11)
+    sorted_keys, _ = sort.sort_by_key(huge, keys, None, 3)
+    assert sorted_keys[:22].get().tolist() == [0] * 11 + [1] * 11
+    expected = np.repeat(np.arange(2, 7), 11)
+    np.testing.assert_array_equal(sorted_keys[BEYOND - 55 :].get(), expected)
 
 
 # --- both designs, all forms of input ---
