@@ -1,18 +1,19 @@
-// Triangles and their bounding spheres, gathered from the mesh once per frame.
+// Triangles and their bounds, gathered from the mesh once per frame.
 //
 // Output layout:
 //   triangles  three float4 a triangle: v0, v1, v2, w unused
-//   spheres       a float4 a triangle: centre, radius; for tests of scattered triangles
-//   sphere_rows   per block of 16 triangles four float16 rows: centre x, y, z, radius; for runs
+//   bounds       cl/bounds.h, for tests of scattered triangles
+//   bound_rows   the same per block of 16 triangles, a float16 each; for runs
 // All are padded to whole blocks; padding has radius -inf, which no test of cl/node.h keeps.
 //
 // Spheres are minimal (design, section 5): the circumcircle's, or that of the longest edge where the
 // triangle is obtuse. The centre is rounded, so the radius is measured from the rounded centre to the
-// three vertices and enlarged by RADIUS_SLACK, eight times the rounding of that distance.
+// three vertices and enlarged by RADIUS_SLACK, more than the rounding of that distance.
 
+#include "bounds.h"
 #include "triangle.h"
 
-#define RADIUS_SLACK (1.0f + 0x1p-20f)
+#define SLAB_SLACK 0x1p-20f // the three dot products: below 8 u times the radius
 
 inline float largest(float4 v)
 {
@@ -55,30 +56,59 @@ inline float4 bounding_sphere(float4 a, float4 b, float4 c)
     return sphere;
 }
 
+// The slab around the sphere's centre, which lies in the plane but for its rounding. A triangle without
+// a normal has a slab without an end.
+inline float4 slab(float4 a, float4 b, float4 c, float4 sphere)
+{
+    const float size = MAX(largest(b - a), largest(c - a));
+    const float4 n = size > 0.0f ? cross3((b - a) / size, (c - a) / size) : (float4)0.0f;
+    const float length = sqrt(dot3(n, n));
+    if (!(length > 0x1p-20f && sphere.w < INFINITY)) // below, the normal is rounding
+        return (float4)(0.0f, 0.0f, 0.0f, INFINITY);
+    float4 result = n / length;
+    const float high = MAX(fabs(dot3(result, a - sphere)), fabs(dot3(result, b - sphere)));
+    result.w = MAX(high, fabs(dot3(result, c - sphere))) + SLAB_SLACK * sphere.w;
+    return result;
+}
+
+// Half extents around the sphere's centre; differences are rounded once.
+inline float4 half_extents(float4 a, float4 b, float4 c, float4 sphere)
+{
+    const float4 da = fabs(a - sphere), db = fabs(b - sphere), dc = fabs(c - sphere);
+    const float4 ab = da > db ? da : db;
+    float4 result = (ab > dc ? ab : dc) * RADIUS_SLACK;
+    result.w = 0.0f;
+    return result;
+}
+
 // One work-item gathers one block of 16 triangles.
 kernel void gather_triangles(const uint num_triangles, global const float *restrict vertices,
                              global const uint *restrict faces, global float4 *restrict triangles,
-                             global float4 *restrict spheres, global float *restrict sphere_rows)
+                             global float4 *restrict bounds, global float *restrict bound_rows)
 {
     const uint block = get_global_id(0);
     for (uint lane = 0; lane < 16; lane++) {
         const uint i = block * 16 + lane;
         float4 v[3] = {0.0f, 0.0f, 0.0f};
-        float4 sphere = (float4)(0.0f, 0.0f, 0.0f, -INFINITY);
+        float4 bound[BOUND_FLOAT4S] = {(float4)(0.0f, 0.0f, 0.0f, -INFINITY), 0.0f, 0.0f};
         if (i < num_triangles) {
             for (uint corner = 0; corner < 3; corner++) {
                 global const float *p = vertices + 3 * (ulong)faces[3 * i + corner];
                 v[corner] = (float4)(p[0], p[1], p[2], 0.0f);
             }
-            sphere = bounding_sphere(v[0], v[1], v[2]);
+            bound[0] = bounding_sphere(v[0], v[1], v[2]);
+            bound[1] = slab(v[0], v[1], v[2], bound[0]);
+            bound[2] = half_extents(v[0], v[1], v[2], bound[0]);
         }
         for (uint corner = 0; corner < 3; corner++)
             triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = v[corner];
-        spheres[i] = sphere;
-        global float *rows = sphere_rows + 64 * (ulong)block + lane;
-        rows[0] = sphere.x;
-        rows[16] = sphere.y;
-        rows[32] = sphere.z;
-        rows[48] = sphere.w;
+        for (uint part = 0; part < BOUND_FLOAT4S; part++) {
+            bounds[BOUND_FLOAT4S * (ulong)i + part] = bound[part];
+            global float *rows = bound_rows + 16 * (BOUND_ROWS * (ulong)block + 4 * part) + lane;
+            rows[0] = bound[part].x;
+            rows[16] = bound[part].y;
+            rows[32] = bound[part].z;
+            rows[48] = bound[part].w;
+        }
     }
 }

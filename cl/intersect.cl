@@ -13,6 +13,47 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
     return slot < num_slots ? slots[slot] : INVALID;
 }
 
+// The corners of the triangles of up to WIDTH pairs; the last pair fills up.
+inline void gather_corners(global const Pair *pairs, uint count, global const float4 *triangles,
+                           Corner16 *corners)
+{
+    for (uint corner = 0; corner < 3; corner++) {
+        float4 s[WIDTH] __attribute__((aligned(64)));
+        for (uint k = 0; k < WIDTH; k++)
+            s[k] = triangles[TRIANGLE_FLOAT4S * (ulong)pairs[k < count ? k : count - 1].y + corner];
+        float16 unused;
+        TRANSPOSE16(s, corners[corner].x, corners[corner].y, corners[corner].z, unused);
+    }
+}
+
+// One ray and up to WIDTH triangles: bit k of the result says whether triangle k is hit at t[k].
+inline uint intersect_run(const RayFrame *frame, const Corner16 *corners, uint count, float16 *t)
+{
+    float16 edges[3], depths[3];
+    const int16 inside
+        = inside_edges_run(frame, corners[0], corners[1], corners[2], edges, depths);
+    const uint lanes = (1u << count) - 1;
+    if ((MASK16(inside) & lanes) == 0)
+        return 0;
+    const TriangleHit16 h = finish_hit_run(frame, inside, edges, depths);
+    *t = h.t;
+    return MASK16(h.hit) & lanes;
+}
+
+// Smallest key of the triangles whose bit is set.
+inline ulong nearest_key(global const Pair *pairs, uint mask, float16 distances)
+{
+    float t[WIDTH] __attribute__((aligned(64)));
+    *(float16 *)t = distances;
+    ulong nearest = MISS;
+    for (; mask != 0; mask &= mask - 1) {
+        const uint k = LOWEST(mask);
+        const ulong key = hit_key(t[k], pairs[k].y);
+        nearest = MIN(nearest, key);
+    }
+    return nearest;
+}
+
 // Pairs (node, triangle) whose nodes hold `rays_per_node` consecutive slots; a run of pairs shares its
 // rays. Sets the minimum in `result`, or where any hit is asked for, the flag; counts tests and hits
 // per chunk.
@@ -27,19 +68,22 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
         const uint n = *length;                                                                    \
         ulong tests = 0, hits = 0;                                                                 \
         for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {                              \
-            const uint count = run_length(pairs, i, end);                                          \
+            const uint first_slot = pairs[i].x * rays_per_node;                                    \
+            const uint count = run_length(pairs, i, MIN(i + WIDTH, end));                          \
+            Corner16 corners[3];                                                                   \
+            gather_corners(pairs + i, count, triangles, corners);                                  \
             for (uint k = 0; k < rays_per_node; k++) {                                             \
-                const uint ray = ray_of(pairs[i].x * rays_per_node + k, num_slots, slots);         \
+                const uint ray = ray_of(first_slot + k, num_slots, slots);                         \
                 if (ray == INVALID || dir_tfar[ray].w < org_tnear[ray].w)                          \
                     continue;                                                                      \
                 const RayFrame frame = ray_frame(org_tnear[ray], dir_tfar[ray]);                   \
-                uint found = 0;                                                                    \
-                const ulong nearest                                                                \
-                    = intersect_run(&frame, pairs + i, count, triangles, &found);                  \
+                float16 t;                                                                         \
+                const uint mask = intersect_run(&frame, corners, count, &t);                       \
                 tests += count;                                                                    \
-                hits += found;                                                                     \
-                if (found)                                                                         \
+                if (mask) {                                                                        \
+                    hits += COUNT16(mask);                                                         \
                     ON_HITS;                                                                       \
+                }                                                                                  \
             }                                                                                      \
             i += count;                                                                            \
         }                                                                                          \
@@ -47,24 +91,8 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
         chunk_hits[get_global_id(0)] = hits;                                                       \
     }
 
-inline ulong intersect_run(const RayFrame *frame, global const Pair *pairs, uint count,
-                           global const float4 *triangles, uint *found)
-{
-    ulong nearest = MISS;
-    for (uint k = 0; k < count; k++) {
-        const uint triangle = pairs[k].y;
-        const TriangleHit h
-            = intersect_triangle(frame, triangles + TRIANGLE_FLOAT4S * (ulong)triangle);
-        if (h.hit) {
-            const ulong key = hit_key(h.t, triangle);
-            nearest = MIN(nearest, key);
-            *found += 1;
-        }
-    }
-    return nearest;
-}
-
-DEFINE_INTERSECT_PAIRS(intersect_pairs, ulong, atom_min(result + ray, nearest))
+DEFINE_INTERSECT_PAIRS(intersect_pairs, ulong,
+                       atom_min(result + ray, nearest_key(pairs + i, mask, t)))
 DEFINE_INTERSECT_PAIRS(occlude_pairs, uchar, result[ray] = 1)
 
 // One work-item: row `row` of counts grows by the chunks' counts of the final tests.

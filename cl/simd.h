@@ -6,6 +6,7 @@
 // seven; both forms round once, so results are equal bit for bit.
 //
 //   FMA(a, b, c), FMA16(a, b, c)   a * b + c, rounded once
+//   SQRT16(v)                      square roots, correctly rounded
 //   MASK16(m)                      bit i: lane i of a comparison's result (0 or -1)
 //   COUNT16(mask), COUNT64(mask)   number of bits set
 //   LOWEST(mask)                   number of the lowest bit set, of a mask that is not 0
@@ -35,6 +36,7 @@
 
 #ifdef __AVX512DQ__
 #define FMA16(a, b, c) __builtin_ia32_vfmaddps512_mask(a, b, c, (short)-1, 4)
+#define SQRT16(v) __builtin_ia32_sqrtps512(v, 4)
 #define MASK16(m) ((uint)(ushort)__builtin_ia32_cvtd2mask512(m))
 #define COMPRESS16(v, mask)                                                                        \
     as_uint16(__builtin_ia32_compresssi512_mask(as_int16(v), (int16)0, (short)(mask)))
@@ -70,6 +72,8 @@ inline float16 FMA16(float16 a, float16 b, float16 c)
     return (float16)(__builtin_ia32_vfmaddps256(a.lo, b.lo, c.lo),
                      __builtin_ia32_vfmaddps256(a.hi, b.hi, c.hi));
 }
+#define SQRT16(v)                                                                                  \
+    (float16)(__builtin_ia32_sqrtps256((v).lo), __builtin_ia32_sqrtps256((v).hi))
 inline uint MASK16(int16 m)
 {
     return (uint)__builtin_ia32_movmskps256(as_float8(m.lo))
@@ -81,6 +85,7 @@ inline uint MASK16(int16 m)
 
 #define FMA(a, b, c) fma(a, b, c)
 #define FMA16(a, b, c) fma(a, b, c)
+#define SQRT16(v) sqrt(v)
 
 inline uint MASK16(int16 m)
 {

@@ -9,6 +9,8 @@
 // past the cache: scattered stores would fetch every line first and miss the page tables (the buffered
 // scatter of Satish et al. 2010). There digits may be wider, for fewer passes.
 //
+// The number of elements is in device memory: *length, of arrays that may be longer.
+//
 // Build-time constants: KEY (uint, ulong), VALUE (uint, ulong), CHUNKS, DIGITS (2^bits of a digit);
 // KEYS_ALONE where there are no values; FROM_PACKED, TO_PACKED where the pass reads or writes packed
 // words. Arrays that these rule out are not touched.
@@ -24,9 +26,11 @@
 #endif
 
 // counts[digit * CHUNKS + chunk]
-kernel void count_digits(const ulong n, const uint shift, global const KEY *restrict keys_in,
-                         global const uint2 *restrict packed_in, global uint *restrict counts)
+kernel void count_digits(global const uint *restrict length, const uint shift,
+                         global const KEY *restrict keys_in, global const uint2 *restrict packed_in,
+                         global uint *restrict counts)
 {
+    const ulong n = *length;
     // Two tables: equal digits in a row would wait for each other's increments.
     uint even[DIGITS] = {0}, odd[DIGITS] = {0};
     ulong i = chunk_begin(n);
@@ -52,12 +56,14 @@ kernel void scan_digits(global uint *restrict counts)
     }
 }
 
-kernel void scatter_digits(const ulong n, const uint shift, global const KEY *restrict keys_in,
+kernel void scatter_digits(global const uint *restrict length, const uint shift,
+                           global const KEY *restrict keys_in,
                            global const VALUE *restrict values_in,
                            global const uint2 *restrict packed_in,
                            global const uint *restrict counts, global KEY *restrict keys_out,
                            global VALUE *restrict values_out, global uint2 *restrict packed_out)
 {
+    const ulong n = *length;
     uint places[DIGITS];
     for (uint d = 0; d < DIGITS; d++)
         places[d] = counts[d * CHUNKS + get_global_id(0)];
@@ -110,11 +116,13 @@ inline void store_whole(Elements out, Elements line, uint begin)
 // As scatter_digits. Element p waits at p % LINE of its digit's line until the line is full. A digit's
 // first and last line in a chunk may be shared with other chunks: these store their own elements only.
 // lines: CHUNKS * DIGITS * LINE elements.
-kernel void scatter_lines(const ulong n, const uint shift, global const KEY *restrict keys_in,
+kernel void scatter_lines(global const uint *restrict length, const uint shift,
+                          global const KEY *restrict keys_in,
                           global const VALUE *restrict values_in,
                           global const uint *restrict counts, global KEY *key_lines,
                           global VALUE *value_lines, global KEY *keys_out, global VALUE *values_out)
 {
+    const ulong n = *length;
     const Elements out = {keys_out, values_out};
     uint places[DIGITS];
     for (uint d = 0; d < DIGITS; d++)

@@ -5,108 +5,180 @@
 // once. Tests only mark survivors (a mask per pair, a count per chunk); cl/pairs.cl makes the next
 // level's stream of them.
 //
-// Layouts: nodes in cl/node.h, triangle spheres in cl/geometry.cl, streams in cl/pairs.h.
-// Build-time constants: ARITY, CHUNKS.
+// Layouts: nodes in cl/node.h, triangle bounds in cl/geometry.cl, streams in cl/pairs.h.
+// Build-time constants: ARITY, CHUNKS; OBJECTS where objects are tested before their triangles;
+// PAPER_BOUNDS (cl/node.h).
+
+#pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 
 #include "node.h"
 #include "pairs.h"
 
-// --- top level: tasks are (node, run of RUN triangles), in this order ---------------------------
+// --- top level: tasks are (node, one of its parts of the scene), in this order -------------------
+//
+// Without OBJECTS a part is RUN triangles. With OBJECTS (whole-mesh culling, Reis et al. 2017, section
+// 3.3.7) it is a block of 16 objects, runs of an order of the triangles, and only those whose bounding
+// sphere meets the node are gone through.
 
 #define RUN 256
 
-inline float top_field(global const float *blocks, uint node, uint row)
+typedef struct {
+    global const float *blocks;
+    global const float16 *bound_rows; // of the triangles, by position in the order
+    uint first, last;                  // positions of this batch
+#ifdef OBJECTS
+    global const float16 *object_rows;
+    global const uint *ranges, *order;
+    uint num_objects;
+#endif
+} Top;
+
+inline global const float *node_rows(global const float *blocks, uint node)
 {
-    return blocks[(ulong)(node / ARITY) * (NODE_ROWS * ARITY) + row * ARITY + node % ARITY];
+    return blocks + (ulong)(node / ARITY) * (NODE_ROWS * ARITY) + node % ARITY;
 }
 
-// Survivors among the 16 triangles of sphere block `block` that lie in begin .. end.
-inline uint test_block(global const float *blocks, uint node, global const float16 *sphere_rows,
-                       uint block, uint begin, uint end)
+// Tests the triangles at begin .. end; returns how many survive, and where `out` is not null writes
+// their pairs.
+inline uint test_run(const Top *top, uint node, uint begin, uint end, global Pair *out)
 {
-    global const float16 *rows = sphere_rows + 4 * (ulong)block;
-    const uint mask = MASK16(node_meets_sphere(
-        top_field(blocks, node, 0), top_field(blocks, node, 1), top_field(blocks, node, 2),
-        top_field(blocks, node, 3), top_field(blocks, node, 4), top_field(blocks, node, 5),
-        top_field(blocks, node, 6), top_field(blocks, node, 7), top_field(blocks, node, 8),
-        top_field(blocks, node, 9), rows[0], rows[1], rows[2], rows[3]));
-    const uint from_begin = begin > block * 16 ? 0xffffu << (begin - block * 16) : 0xffffu;
-    const uint to_end = end < block * 16 + 16 ? (1u << (end - block * 16)) - 1 : 0xffffu;
-    return mask & from_begin & to_end;
-}
-
-// Triangles first_triangle .. last_triangle are this batch.
-kernel void count_top(const uint num_nodes, const uint first_triangle, const uint last_triangle,
-                      global const float *restrict blocks, global const float16 *restrict sphere_rows,
-                      global ulong *restrict chunk_tests, global ulong *restrict chunk_hits)
-{
-    const uint runs = (last_triangle - first_triangle + RUN - 1) / RUN;
-    const ulong tasks = (ulong)num_nodes * runs;
-    ulong tests = 0, hits = 0;
-    for (ulong task = chunk_begin(tasks), end = chunk_end(tasks); task < end; task++) {
-        const uint node = task / runs;
-        const uint begin = first_triangle + (task % runs) * RUN;
-        const uint stop = MIN(begin + RUN, last_triangle);
-        if (top_field(blocks, node, 9) < 0.0f)
-            continue; // a null node is never tested
-        tests += stop - begin;
-        for (uint block = begin / 16; block * 16 < stop; block++)
-            hits += COUNT16(test_block(blocks, node, sphere_rows, block, begin, stop));
+    global const float *rows = node_rows(top->blocks, node);
+    uint hits = 0;
+    for (uint block = begin / 16; block * 16 < end; block++) {
+        float16 bounds[BOUND_ROWS];
+        for (uint row = 0; row < BOUND_ROWS; row++)
+            bounds[row] = top->bound_rows[(ulong)block * BOUND_ROWS + row];
+        const uint from_begin = begin > block * 16 ? 0xffffu << (begin - block * 16) : 0xffffu;
+        const uint to_end = end < block * 16 + 16 ? (1u << (end - block * 16)) - 1 : 0xffffu;
+        uint mask = MASK16(NODE_MEETS(rows, bounds)) & from_begin & to_end;
+        if (out == 0) {
+            hits += COUNT16(mask);
+            continue;
+        }
+        for (; mask != 0; mask &= mask - 1) {
+            const uint position = block * 16 + LOWEST(mask);
+#ifdef OBJECTS
+            out[hits++] = (Pair)(node, top->order[position]);
+#else
+            out[hits++] = (Pair)(node, position);
+#endif
+        }
     }
-    chunk_tests[get_global_id(0)] = tests;
-    chunk_hits[get_global_id(0)] = hits;
+    return hits;
 }
 
-kernel void write_top(const uint num_nodes, const uint first_triangle, const uint last_triangle,
-                      global const float *restrict blocks, global const float16 *restrict sphere_rows,
+#ifdef OBJECTS
+
+inline uint num_parts(const Top *top) { return (top->num_objects + 15) / 16; }
+
+// An object that two batches share is tested in both, and counted where it begins.
+inline uint test_part(const Top *top, uint node, uint part, global Pair *out, ulong *tests,
+                      ulong *object_tests)
+{
+    const uint first = part * 16, stop = MIN(first + 16, top->num_objects);
+    float16 spheres[4];
+    for (uint row = 0; row < 4; row++)
+        spheres[row] = top->object_rows[(ulong)part * 4 + row];
+    const uint mask = MASK16(node_meets_spheres(node_rows(top->blocks, node), spheres));
+    uint hits = 0;
+    for (uint o = first; o < stop; o++) {
+        const uint whole = top->ranges[o], next = top->ranges[o + 1];
+        const uint begin = MAX(whole, top->first), end = MIN(next, top->last);
+        *object_tests += whole >= top->first && whole < top->last && whole < next;
+        if (begin >= end || !(mask >> (o - first) & 1))
+            continue;
+        *tests += end - begin;
+        hits += test_run(top, node, begin, end, out == 0 ? 0 : out + hits);
+    }
+    return hits;
+}
+
+#else
+
+inline uint num_parts(const Top *top) { return (top->last - top->first + RUN - 1) / RUN; }
+
+inline uint test_part(const Top *top, uint node, uint part, global Pair *out, ulong *tests,
+                      ulong *object_tests)
+{
+    const uint begin = top->first + part * RUN, end = MIN(begin + RUN, top->last);
+    *tests += end - begin;
+    return test_run(top, node, begin, end, out);
+}
+
+#endif
+
+// All tasks of this work-item; returns the number of survivors. A null node is never tested.
+inline ulong test_tasks(const Top *top, uint num_nodes, global Pair *out, ulong *tests,
+                        ulong *object_tests)
+{
+    const uint parts = num_parts(top);
+    const ulong tasks = (ulong)num_nodes * parts;
+    ulong hits = 0;
+    for (ulong task = chunk_begin(tasks), end = chunk_end(tasks); task < end; task++) {
+        const uint node = task / parts;
+        if (node_rows(top->blocks, node)[9 * ARITY] >= 0.0f)
+            hits += test_part(top, node, task % parts, out == 0 ? 0 : out + hits, tests,
+                              object_tests);
+    }
+    return hits;
+}
+
+#ifdef OBJECTS
+#define OBJECT_ARGUMENTS                                                                           \
+    , const uint num_objects, global const float16 *restrict object_rows,                          \
+        global const uint *restrict ranges, global const uint *restrict order
+#define MAKE_TOP {blocks, bound_rows, first, last, object_rows, ranges, order, num_objects}
+#else
+#define OBJECT_ARGUMENTS
+#define MAKE_TOP {blocks, bound_rows, first, last}
+#endif
+
+// Positions first .. last of the triangles' order are this batch; *object_tests is added to.
+kernel void count_top(const uint num_nodes, const uint first, const uint last,
+                      global const float *restrict blocks,
+                      global const float16 *restrict bound_rows,
+                      global ulong *restrict chunk_tests, global ulong *restrict chunk_hits,
+                      global ulong *restrict object_tests OBJECT_ARGUMENTS)
+{
+    const Top top = MAKE_TOP;
+    ulong tests = 0, objects = 0;
+    chunk_hits[get_global_id(0)] = test_tasks(&top, num_nodes, 0, &tests, &objects);
+    chunk_tests[get_global_id(0)] = tests;
+    if (objects != 0)
+        atom_add(object_tests, objects);
+}
+
+kernel void write_top(const uint num_nodes, const uint first, const uint last,
+                      global const float *restrict blocks,
+                      global const float16 *restrict bound_rows,
                       global const uint *restrict offsets, global const uint *restrict out_length,
-                      global Pair *restrict out)
+                      global Pair *restrict out OBJECT_ARGUMENTS)
 {
     if (*out_length == 0)
         return;
-    const uint runs = (last_triangle - first_triangle + RUN - 1) / RUN;
-    const ulong tasks = (ulong)num_nodes * runs;
-    uint next = offsets[get_global_id(0)];
-    for (ulong task = chunk_begin(tasks), end = chunk_end(tasks); task < end; task++) {
-        const uint node = task / runs;
-        const uint begin = first_triangle + (task % runs) * RUN;
-        const uint stop = MIN(begin + RUN, last_triangle);
-        if (top_field(blocks, node, 9) < 0.0f)
-            continue;
-        for (uint block = begin / 16; block * 16 < stop; block++) {
-            uint mask = test_block(blocks, node, sphere_rows, block, begin, stop);
-            for (uint triangle = block * 16; mask != 0; triangle++, mask >>= 1) {
-                if (mask & 1u)
-                    out[next++] = (Pair)(node, triangle);
-            }
-        }
-    }
+    const Top top = MAKE_TOP;
+    ulong tests = 0, objects = 0;
+    test_tasks(&top, num_nodes, out + offsets[get_global_id(0)], &tests, &objects);
 }
 
 // --- every level below ---------------------------------------------------------------------------
 
-// The spheres of the triangles of up to sixteen pairs as rows; the last pair fills up.
-typedef struct {
-    float16 x, y, z, d;
-} SphereRows;
+#ifdef PAPER_BOUNDS
+#define NUM_BOUNDS 1 // float4 of a triangle that are needed
+#else
+#define NUM_BOUNDS BOUND_FLOAT4S
+#endif
 
-inline SphereRows gather_spheres(global const Pair *pairs, uint count,
-                                 global const float4 *spheres)
+// The bounds of the triangles of up to sixteen pairs as rows; the last pair fills up.
+inline void gather_bounds(global const Pair *pairs, uint count, global const float4 *bounds,
+                          float16 *rows)
 {
-    float4 s[WIDTH] __attribute__((aligned(64)));
-    for (uint k = 0; k < WIDTH; k++)
-        s[k] = spheres[pairs[k < count ? k : count - 1].y];
-    SphereRows rows;
-    TRANSPOSE16(s, rows.x, rows.y, rows.z, rows.d);
-    return rows;
-}
-
-inline int16 test_child(global const float *block, uint child, const SphereRows *p)
-{
-    global const float *f = block + child;
-    return node_meets_sphere(f[0], f[ARITY], f[2 * ARITY], f[3 * ARITY], f[4 * ARITY], f[5 * ARITY],
-                             f[6 * ARITY], f[7 * ARITY], f[8 * ARITY], f[9 * ARITY], p->x, p->y,
-                             p->z, p->d);
+    for (uint part = 0; part < NUM_BOUNDS; part++, rows += 4) {
+        float4 s[WIDTH] __attribute__((aligned(64)));
+        for (uint k = 0; k < WIDTH; k++)
+            s[k] = bounds[BOUND_FLOAT4S * (ulong)pairs[k < count ? k : count - 1].y + part];
+        TRANSPOSE16(s, rows[0], rows[1], rows[2], rows[3]);
+    }
 }
 
 inline void store_masks(global Mask *masks, uchar16 values, uint count)
@@ -124,7 +196,7 @@ inline void store_masks(global Mask *masks, uchar16 values, uint count)
 // `valid[node]`: children of the node that are not null, the tests that a pair costs.
 kernel void test_children(global const uint *restrict length, global const Pair *restrict pairs,
                           global const float *restrict blocks, global const uint *restrict valid,
-                          global const float4 *restrict spheres, global Mask *restrict masks,
+                          global const float4 *restrict bounds, global Mask *restrict masks,
                           global ulong *restrict chunk_tests, global ulong *restrict chunk_hits)
 {
     const uint n = *length;
@@ -133,11 +205,12 @@ kernel void test_children(global const uint *restrict length, global const Pair 
         const uint node = pairs[i].x;
         const uint count = run_length(pairs, i, MIN(i + WIDTH, end));
         const uint lanes = (1u << count) - 1;
-        const SphereRows rows = gather_spheres(pairs + i, count, spheres);
+        float16 rows[BOUND_ROWS];
+        gather_bounds(pairs + i, count, bounds, rows);
         global const float *block = blocks + (ulong)node * (NODE_ROWS * ARITY);
         int16 mask = 0;
         for (uint child = 0; child < ARITY; child++) {
-            const int16 hit = test_child(block, child, &rows);
+            const int16 hit = NODE_MEETS(block + child, rows);
             mask |= hit & (1 << child);
             hits += COUNT16(MASK16(hit) & lanes);
         }

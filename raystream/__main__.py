@@ -3,6 +3,7 @@
 import argparse
 import inspect
 import pathlib
+import re
 import sys
 
 import pyopencl as cl
@@ -15,7 +16,7 @@ from raystream.camera import Camera
 from raystream.device import default_device, devices
 from raystream.errors import BuildError, DeviceError
 from raystream.light import PointLight
-from raystream.renderer import Renderer
+from raystream.renderer import Renderer, parse_method
 from raystream.scene import load_scene
 from raystream.tracer import methods
 
@@ -38,6 +39,7 @@ _SCENE_HELP = (
     + ", ".join(PROCEDURAL)
     + "; rings:3 passes an argument"
 )
+_METHOD_HELP = "options of a method follow it: rsh:arity=8:levels=2"
 _RENDER_EXAMPLES = """examples:
   raystream render demo -o demo.png
   raystream render kitchen.glb -o kitchen.png --size 1024x768 --mirror 'floor*' --samples 4
@@ -47,6 +49,7 @@ _RENDER_EXAMPLES = """examples:
 _COMPARE_EXAMPLES = """examples:
   raystream compare demo --methods rsh,embree -o demo
   raystream compare bunny.ply --methods rsh,brute,embree --mirror '*'
+  raystream compare cornell --methods rsh:arity=8:levels=2,rsh --counts
 """
 
 
@@ -99,7 +102,9 @@ def _add_render(commands):
     )
     _add_scene(command)
     command.add_argument("-o", "--output", required=True, help="picture: .png .jpg .exr .npy")
-    command.add_argument("--method", default="rsh", help=f"one of {', '.join(methods())}")
+    command.add_argument(
+        "--method", default="rsh", help=f"one of {', '.join(methods())}; {_METHOD_HELP}"
+    )
     command.add_argument("--samples", type=int, default=1, help="samples per pixel")
     command.add_argument(
         "--verify",
@@ -120,7 +125,13 @@ def _add_compare(commands):
     command.add_argument(
         "--methods",
         default="rsh,brute,embree",
-        help=f"of {', '.join(methods())} and embree, with commas between (default: %(default)s)",
+        help=f"of {', '.join(methods())} and embree, with commas between (default: %(default)s); "
+        + _METHOD_HELP,
+    )
+    command.add_argument(
+        "--counts",
+        action="store_true",
+        help="print the tests of every level by kind of ray, their sums and the stage times",
     )
     command.add_argument("-o", "--output", help="folder for the pictures")
     command.set_defaults(run=_compare)
@@ -218,9 +229,10 @@ def _render(options):
     path = images.check_suffix(options.output)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: no such folder")
+    method, method_options = parse_method(options.method, methods())
     scene = _scene(options)
     camera = _camera(options, scene)
-    renderer = Renderer(scene, options.method)
+    renderer = Renderer(scene, method, **method_options)
     with tqdm(total=options.samples, unit="sample", disable=None) as bar:
         frame = renderer.render(
             camera,
@@ -233,37 +245,47 @@ def _render(options):
     print(f"{options.output}: {frame.statistics.rays} secondary rays, {options.method}")
     if not options.verify:
         return 0
-    return _report([options.method], options, scene, camera, None)
+    results, _ = _results([(options.method, method, method_options)], options, scene, camera)
+    return _failed(results)
 
 
 def _compare(options):
-    names = [name.strip() for name in options.methods.split(",") if name.strip()]
-    from raystream.compare import EMBREE
-
-    known = (*methods(), EMBREE)
-    for name in names or [options.methods]:
-        if name not in known:
-            raise ValueError(f"--methods: need some of {', '.join(known)}, got {name!r}")
-    scene = _scene(options)
-    return _report(names, options, scene, _camera(options, scene), options.output)
-
-
-def _report(names, options, scene, camera, folder):
-    """Compare, print the table, write the pictures; 1 where a check failed."""
     from raystream import compare  # Embree and scikit-image are needed here only
 
-    with tqdm(total=1 + 2 * len(names) - names.count(compare.EMBREE), disable=None) as bar:
+    names = [name.strip() for name in options.methods.split(",") if name.strip()]
+    if not names:
+        known = ", ".join((*methods(), compare.EMBREE))
+        raise ValueError(f"--methods: need some of {known}, got {options.methods!r}")
+    chosen = [compare.as_method(name) for name in names]
+    scene = _scene(options)
+    results, reference = _results(chosen, options, scene, _camera(options, scene))
+    if options.counts:
+        print("\n".join(["", *compare.count_tables(results)]))
+    if options.output is not None:
+        _save_pictures(pathlib.Path(options.output), results, reference)
+    return _failed(results)
+
+
+def _results(chosen, options, scene, camera):
+    """Compare and print the table; the results and the reference picture."""
+    from raystream import compare
+
+    steps = 1 + sum(1 if method == compare.EMBREE else 2 for _, method, _ in chosen)
+    with tqdm(total=steps, disable=None) as bar:
 
         def progress(line):
             bar.set_description(line)
             bar.update()
 
         results, reference = compare.compare(
-            scene, names, camera, options.size, options.bounces, progress
+            scene, chosen, camera, options.size, options.bounces, progress
         )
     print("\n".join(compare.table(results)))
-    if folder is not None:
-        _save_pictures(pathlib.Path(folder), results, reference)
+    return results, reference
+
+
+def _failed(results):
+    """Name the methods whose check failed; the exit code: 1 where there are some."""
     failed = [result.method for result in results if not result.ok]
     if failed:
         print(f"raystream: not within the rules: {', '.join(failed)}", file=sys.stderr)
@@ -276,9 +298,10 @@ def _save_pictures(folder, results, reference):
     folder.mkdir(parents=True, exist_ok=True)
     images.save(folder / "reference.png", reference)
     for result in results:
-        images.save(folder / f"{result.method}.png", result.frame.image)
+        stem = re.sub(r"[^\w.+-]", "-", result.method)  # ":" and "=" are not for file names
+        images.save(folder / f"{stem}.png", result.frame.image)
         difference = compare.difference_image(result.frame.image, reference)
-        images.save(folder / f"{result.method}-difference.png", difference)
+        images.save(folder / f"{stem}-difference.png", difference)
     images.save(folder / "side-by-side.png", compare.side_by_side(results, reference))
     print(f"pictures in {folder}; differences are {compare.AMPLIFICATION} times amplified")
 

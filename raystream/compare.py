@@ -14,11 +14,24 @@ from raystream.baselines.tolerance import (
     ssim,
 )
 from raystream.image import to_srgb
-from raystream.renderer import Frame, Renderer
-from raystream.tracer import Tracer
+from raystream.renderer import SHADOW, Frame, Renderer, parse_method
+from raystream.statistics import (
+    COMPRESSION,
+    DECOMPRESSION,
+    FINAL_INTERSECTION,
+    GEOMETRY,
+    HIERARCHY_CREATION,
+    RASTERISATION,
+    RAY_CREATION,
+    SHADING,
+    SORTING,
+    STREAM_REDUCTION,
+    TRAVERSAL,
+)
+from raystream.tracer import Tracer, methods
 
 EMBREE = "embree"
-PRIMARY, SHADOW = "primary", "shadow"
+PRIMARY = "primary"
 SECONDARY = "reflection and refraction"
 KINDS = (PRIMARY, SECONDARY, SHADOW)
 PRIMARY_SHARE = 1e-3  # rasterised pixels that may show another triangle than Embree's ray
@@ -26,6 +39,20 @@ MIN_SSIM, MIN_PSNR = 0.995, 40.0
 TIMED_FRAMES = 3
 MOST_SECONDS = 5.0  # no further frame is timed after so long
 AMPLIFICATION = 10
+# The order of tables 5 to 7 of Reis et al. 2017; stages that are not here come after these.
+_STAGES = (
+    GEOMETRY,
+    RASTERISATION,
+    RAY_CREATION,
+    COMPRESSION,
+    SORTING,
+    DECOMPRESSION,
+    HIERARCHY_CREATION,
+    TRAVERSAL,
+    STREAM_REDUCTION,
+    FINAL_INTERSECTION,
+    SHADING,
+)
 
 
 @dataclasses.dataclass
@@ -62,9 +89,11 @@ class Comparison:
     Attributes
     ----------
     method : str
+        With its options, as it was given.
     seconds : float
         Of one frame, the fastest of the timed ones.
     frame : raystream.renderer.Frame
+        That frame.
     checks : dict of str to RayCheck
         By kind of ray (KINDS); empty for Embree itself.
     ssim, psnr : float
@@ -160,6 +189,13 @@ def _active_rays(stream):
     return active, (org_tnear[:, :3], dir_tfar[:, :3], org_tnear[:, 3], dir_tfar[:, 3])
 
 
+def as_method(given):
+    """A method as `compare` takes it, as (label, name, options); ValueError where it is none."""
+    if not isinstance(given, str):
+        return given
+    return (given, *parse_method(given, (*methods(), EMBREE)))
+
+
 def compare(scene, names, camera=None, size=(512, 512), max_bounces=2, progress=None, **options):
     """Render a scene by several methods and hold all of it against Embree.
 
@@ -169,8 +205,9 @@ def compare(scene, names, camera=None, size=(512, 512), max_bounces=2, progress=
     Parameters
     ----------
     scene : raystream.Scene
-    names : list of str
-        Of `raystream.methods`, or "embree".
+    names : list of str or (str, str, dict)
+        Of `raystream.methods`, or "embree"; with options as in "rsh:arity=8:levels=2", or as
+        (label, name, options).
     camera, size, max_bounces
         As for `raystream.render`.
     progress : callable, optional
@@ -185,34 +222,46 @@ def compare(scene, names, camera=None, size=(512, 512), max_bounces=2, progress=
     """
     camera = scene.camera if camera is None else camera
     step = progress or (lambda _line: None)
+    chosen = [as_method(name) for name in names]
+    for _, method, own in chosen:
+        _check_options(scene, method, own, options)
     step("reference renderer")
     reference = render_reference(scene, camera, size=size, max_bounces=max_bounces).image
     results = []
-    for name in names:
-        step(f"{name}: timing")
-        seconds, frame = _timed(scene, name, camera, size, max_bounces, options)
+    for label, method, own in chosen:
+        step(f"{label}: timing")
+        merged = {**options, **own}
+        seconds, frame = _timed(scene, method, camera, size, max_bounces, merged)
         checks = {}
-        if name != EMBREE:
-            step(f"{name}: checking every ray against Embree")
-            checks = _checked(scene, name, camera, size, max_bounces, options)
+        if method != EMBREE:
+            step(f"{label}: checking every ray against Embree")
+            checks = _checked(scene, method, camera, size, max_bounces, merged)
         scores = ssim(frame.image, reference), psnr(frame.image, reference)
-        results.append(Comparison(name, seconds, frame, checks, *scores))
+        results.append(Comparison(label, seconds, frame, checks, *scores))
     return results, reference
+
+
+def _check_options(scene, method, own, options):
+    """Refuse wrong options before any time goes into rendering."""
+    if method != EMBREE:
+        Tracer(scene, method, **{**options, **own})
+    elif own:
+        raise ValueError(f"method {EMBREE!r} has no options, got {', '.join(own)}")
 
 
 def _timed(scene, name, camera, size, max_bounces, options):
     method = EmbreeTracer.from_scene(scene) if name == EMBREE else name
     device = {key: options[key] for key in ("device",) if key in options}
     renderer = Renderer(scene, method, **(device if name == EMBREE else options))
-    frame = renderer.render(camera, size, max_bounces)
-    seconds = []
+    renderer.render(camera, size, max_bounces)
+    timed = []
     for _ in range(TIMED_FRAMES):
         start = time.perf_counter()
         frame = renderer.render(camera, size, max_bounces)
-        seconds.append(time.perf_counter() - start)
-        if sum(seconds) > MOST_SECONDS:
+        timed.append((time.perf_counter() - start, frame))
+        if sum(seconds for seconds, _ in timed) > MOST_SECONDS:
             break
-    return min(seconds), frame
+    return min(timed, key=lambda pair: pair[0])
 
 
 def _checked(scene, name, camera, size, max_bounces, options):
@@ -252,8 +301,104 @@ def _aligned(rows):
         "  ".join(
             str(cell).ljust(width) if i == 0 else str(cell).rjust(width)
             for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
+        ).rstrip()
         for row in rows
+    ]
+
+
+def count_tables(results):
+    """What was counted, as lines of text, after tables 1 to 7 of Reis et al. 2017.
+
+    For each kind of ray what every method tested, level by level; then the sums of all methods
+    beside each other; then the times of the stages. Methods that count nothing (Embree) are in
+    the last table only.
+    """
+    counting = [r for r in results if r.frame.statistics.total_tests]
+    kinds = dict.fromkeys(kind for r in counting for kind in r.frame.kinds)
+    lines = []
+    for kind in kinds:
+        lines += [*_kind_table(kind, counting), ""]
+    if counting:
+        lines += [*_sum_table(counting), ""]
+    return lines + _stage_table(results)
+
+
+def _kind_table(kind, results):
+    blocks = []
+    for r in results:
+        counts = r.frame.kinds.get(kind)
+        if counts is not None:
+            size = f"{counts.rays:,} rays x {counts.triangles:,} triangles"
+            names = _level_names(r.frame.statistics)
+            names = names[len(names) - len(counts.levels) :]  # a small stream has fewer levels
+            blocks.append((f"{r.method}: {size}", _count_rows(counts, names)))
+    return _in_blocks((f"{kind} rays", "nodes", "tests", "misses", "hits"), blocks)
+
+
+def _level_names(statistics):
+    """Names of the levels of a frame, top first; the last may be the rays themselves.
+
+    Asked of the whole frame: in a small stream every node of the lowest level may hold one ray.
+    """
+    if not statistics.levels:
+        return []
+    rays_tested = statistics.levels[-1]["nodes"] == statistics.rays
+    numbered = [f"level {n}" for n in range(len(statistics.levels) - rays_tested, 0, -1)]
+    return numbered + ["rays"] * rays_tested
+
+
+def _count_rows(counts, level_names):
+    rows = [("mesh tests", "", f"{counts.mesh_tests:,}", "", "")] if counts.mesh_tests else []
+    for name, level in zip(level_names, counts.levels, strict=True):
+        rows.append((name, *(f"{level[key]:,}" for key in ("nodes", "tests", "misses", "hits"))))
+    final = counts.final_tests, counts.final_tests - counts.final_hits, counts.final_hits
+    return [
+        *rows,
+        ("final", "", *(f"{count:,}" for count in final)),
+        ("total", "", f"{counts.total_tests:,}", "", ""),
+        ("of brute force", "", _share_of_brute_force(counts), "", ""),
+    ]
+
+
+def _share_of_brute_force(counts):
+    return f"{counts.total_tests / (counts.rays * counts.triangles):.2%}"
+
+
+def _sum_table(results):
+    first = results[0]
+    rows = [("all rays", "rays", "tests", "of brute force", f"against {first.method}")]
+    for r in results:
+        counts = r.frame.statistics
+        change = counts.total_tests / first.frame.statistics.total_tests - 1
+        rows.append(
+            (
+                r.method,
+                f"{counts.rays:,}",
+                f"{counts.total_tests:,}",
+                _share_of_brute_force(counts),
+                "-" if r is first else f"{change:+.2%}",
+            )
+        )
+    return _aligned(rows)
+
+
+def _stage_table(results):
+    blocks = []
+    for r in results:
+        wall = {stage: times["wall"] for stage, times in r.frame.statistics.stages.items()}
+        total = sum(wall.values())
+        in_order = [stage for stage in dict.fromkeys((*_STAGES, *wall)) if stage in wall]
+        rows = [(s, f"{wall[s] * 1e3:.3f}", f"{wall[s] / total:.2%}") for s in in_order]
+        blocks.append((f"{r.method}: {r.seconds * 1e3:.1f} ms a frame", rows))
+    return _in_blocks(("stages", "ms", "share"), blocks)
+
+
+def _in_blocks(header, blocks):
+    """Rows in columns that all blocks share, each block below its own line of text."""
+    lines = _aligned([header, *((f"  {row[0]}", *row[1:]) for _, rows in blocks for row in rows)])
+    indented = iter(lines[1:])
+    return lines[:1] + [
+        line for title, rows in blocks for line in (title, *(next(indented) for _ in rows))
     ]
 
 

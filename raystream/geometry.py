@@ -1,10 +1,11 @@
-"""A scene's triangles on the device, with their bounding spheres (cl/geometry.cl)."""
+"""A scene's triangles on the device, with their bounds (cl/geometry.cl)."""
 
 import numpy as np
 
 from raystream.statistics import GEOMETRY
 
-_BLOCK = 16  # triangles per sphere block, see cl/geometry.cl
+_BLOCK = 16  # triangles per block of bounds, see cl/geometry.cl
+_BOUND_ROWS = 12
 
 
 class Geometry:
@@ -20,25 +21,28 @@ class Geometry:
     num_triangles : int
     triangles : Array of shape (num_blocks * 16, 12) float32
         v0, v1, v2 as float4, the fourth component unused.
-    spheres : Array of shape (num_blocks * 16, 4) float32
-        Centre and radius of each triangle's bounding sphere.
-    sphere_rows : Array of shape (num_blocks, 4, 16) float32
-        The same as rows x, y, z and radius of 16 triangles.
+    bounds : Array of shape (num_blocks * 16, 12) float32
+        Centre and radius of each triangle's bounding sphere; around that centre unit normal and
+        half thickness of a slab, and half extents of a box, and 0.
+    bound_rows : Array of shape (num_blocks, 12, 16) float32
+        The same as rows of 16 triangles.
     geom_ids : Array of shape (num_triangles,) uint32
     first_prims : Array of shape (num_meshes + 1,) uint32
         First flat triangle of each mesh.
+    version : int
+        Counts the updates: what is derived from the vertices is made anew where it changed.
     """
 
     def __init__(self, session, scene):
-        self.session = session
+        self.session, self.version = session, 0
         self.num_triangles = scene.num_triangles
         self._num_blocks = -(-self.num_triangles // _BLOCK)
         self.faces = session.upload(GEOMETRY, scene.faces.astype(np.uint32))
         self.geom_ids = session.upload(GEOMETRY, scene.geom_ids.astype(np.uint32))
         self.first_prims = session.upload(GEOMETRY, scene.first_prims.astype(np.uint32))
         self.triangles = session.empty((self._num_blocks * _BLOCK, 12), np.float32)
-        self.spheres = session.empty((self._num_blocks * _BLOCK, 4), np.float32)
-        self.sphere_rows = session.empty((self._num_blocks, 4, _BLOCK), np.float32)
+        self.bounds = session.empty((self._num_blocks * _BLOCK, _BOUND_ROWS), np.float32)
+        self.bound_rows = session.empty((self._num_blocks, _BOUND_ROWS, _BLOCK), np.float32)
         self._vertices = session.empty(scene.vertices.shape, np.float32)
         self.update(scene.vertices)
 
@@ -46,6 +50,7 @@ class Geometry:
         """Take new vertices, (N, 3) float32 in the scene's order; topology unchanged."""
         self.session.upload(GEOMETRY, vertices, self._vertices)
         self._gather(self._vertices)
+        self.version += 1
 
     def _gather(self, vertices):
         self.session.launch(
@@ -56,6 +61,6 @@ class Geometry:
             vertices,
             self.faces,
             self.triangles,
-            self.spheres,
-            self.sphere_rows,
+            self.bounds,
+            self.bound_rows,
         )

@@ -1,61 +1,18 @@
 """The ray-space hierarchy: cone-spheres over a ray stream, built bottom-up (cl/hierarchy.cl)."""
 
-import functools
-
 import numpy as np
 
 from raystream import device
 from raystream.checks import check_choice, check_count
+from raystream.hash import DEFAULT_HASH
+from raystream.order import hashed_slots, leaf_slots
 from raystream.rays import Rays, from_numpy
 from raystream.statistics import HIERARCHY_CREATION
 
 ARITIES = (4, 8)
-NODE_ROWS = 10  # cl/node.h
-_INVALID = np.uint32(0xFFFFFFFF)
-_TILE = 8
+BOUNDS = ("tight", "paper")
+NODE_ROWS = 20  # cl/node.h
 _PER_ITEM = 16  # nodes that one work-item of cl/hierarchy.cl makes
-
-
-def screen_slots(width, height):
-    """The rays of a screen in the order of the hierarchy's leaves.
-
-    Pixels follow the Z-order curve within tiles of 8 x 8, and the tiles that the screen has
-    follow it, too: every 4^k consecutive leaves of a tile are a square, 8 leaves are 4 x 2. Where
-    the side is a power of two this is the quad-tree of the paper; elsewhere only the tiles at the
-    right and lower edge carry null leaves.
-
-    Returns
-    -------
-    ndarray of shape (m,) uint32
-        Ray (pixel) of each leaf, 0xffffffff for a null leaf.
-    """
-    return _screen_slots(width, height).copy()
-
-
-@functools.lru_cache(maxsize=8)
-def _screen_slots(width, height):
-    columns, rows = -(-width // _TILE), -(-height // _TILE)
-    tile_y, tile_x = np.divmod(np.arange(columns * rows, dtype=np.uint64), np.uint64(columns))
-    order = np.argsort(_interleave(tile_x, tile_y), kind="stable")
-    within = np.arange(_TILE * _TILE, dtype=np.uint64)
-    x = tile_x[order, None] * _TILE + _deinterleave(within)
-    y = tile_y[order, None] * _TILE + _deinterleave(within >> np.uint64(1))
-    pixels = np.where((x < width) & (y < height), y * width + x, _INVALID)
-    return pixels.ravel().astype(np.uint32)
-
-
-def _interleave(x, y):
-    """Bits of x at the even places, bits of y at the odd places."""
-    return sum(
-        ((x >> np.uint64(b) & np.uint64(1)) << np.uint64(2 * b))
-        | ((y >> np.uint64(b) & np.uint64(1)) << np.uint64(2 * b + 1))
-        for b in range(24)
-    )
-
-
-def _deinterleave(code):
-    """The number made of the even bits of `code`."""
-    return sum((code >> np.uint64(2 * b) & np.uint64(1)) << np.uint64(b) for b in range(3))
 
 
 class RayHierarchy:
@@ -70,57 +27,72 @@ class RayHierarchy:
     num_nodes : list of int
         Nodes per level, null nodes included; ``num_nodes[0]`` is the number of leaf slots.
     blocks : list of Array
-        Per level the node blocks of cl/node.h.
+        Per level the node blocks of cl/node.h; ``blocks[0]`` is None where no leaves were wanted.
     valid : list of Array
         ``valid[k]`` (k >= 1): children of each node of level k that are not null.
     slots : Array of shape (num_nodes[0],) uint32
         Ray of each leaf, 0xffffffff where there is none.
     """
 
-    def __init__(self, session, rays, slots, arity, levels):
+    def __init__(self, session, rays, slots, arity, levels, bound="tight", leaves=True):
         self.session, self.arity, self.slots = session, arity, slots
-        count = slots.shape[0]
+        self.bound = bound
+        defines = {"PAPER_BOUNDS": 1} if bound == "paper" else {}
+        self._kernels = session.kernels("hierarchy.cl", ARITY=arity, **defines)
+        count = above = slots.shape[0]
         self.num_nodes = [count]
-        while len(self.num_nodes) == 1 or count > 1:
-            count = -(-count // arity)
-            self.num_nodes.append(count)
+        while len(self.num_nodes) == 1 or above > 1:
+            above = -(-above // arity)
+            self.num_nodes.append(above)
             if len(self.num_nodes) - 1 == levels:
                 break
         self.num_levels = len(self.num_nodes) - 1
-        self.blocks = [self._empty_blocks(n) for n in self.num_nodes]
+        self.blocks = [None, *(self._empty_blocks(n) for n in self.num_nodes[1:])]
         self.valid = [None]
-        self._build_leaves(rays)
-        for level in range(1, self.num_levels + 1):
-            self._build_level(level)
+        if leaves:
+            self.blocks[0] = self._empty_blocks(count)
+            self._build_leaves(rays)
+            self._build_level(1, "build_parents", self.blocks[0])
+        else:
+            self._build_level(1, "build_parents_of_rays", slots, rays.org_tnear, rays.dir_tfar)
+        for level in range(2, self.num_levels + 1):
+            self._build_level(level, "build_parents", self.blocks[level - 1])
 
     @classmethod
-    def build(cls, rays, arity=4, levels=None, order="screen"):
+    def build(cls, rays, arity=4, levels=None, order="screen", bound="tight"):
         """Build the hierarchy of a ray stream.
 
         Parameters
         ----------
         rays : raystream.rays.Rays or (origins, directions)
-            Rays on the device, or arrays as for `Tracer.intersect`. With a `size` the leaves
-            follow the screen (`screen_slots`), else the order of the rays.
+            Rays on the device, or arrays as for `Tracer.intersect`.
         arity : {4, 8}
         levels : int, optional
             Levels above the rays; default: up to a single root.
-        order : {"screen"}
+        order : {"screen", "hash"}
+            The leaves follow the screen (`order.screen_slots`), or the order of the rays where
+            these have no `size`; or they are sorted by their hash, as `crsh` does by default.
+        bound : {"tight", "paper"}
+            How nodes are united: see cl/hierarchy.cl and cl/paper_bounds.h.
 
         Raises
         ------
         ValueError
-            An arity, level or order that there is not.
+            An arity, level, order or bound that there is not.
         """
         check_choice("arity", arity, ARITIES)
-        check_choice("order", order, ("screen",))
+        check_choice("order", order, ("screen", "hash"))
+        check_choice("bound", bound, BOUNDS)
         if levels is not None:
             check_count("levels", levels)
         if not isinstance(rays, Rays):
             origins, directions = rays
             rays = from_numpy(device.session(), origins, directions, 0.0, np.inf)
         session = device.session_of(rays.org_tnear)
-        hierarchy = cls(session, rays, leaf_slots(session, rays), arity, levels)
+        slots = leaf_slots(session, rays)
+        if order == "hash":
+            slots = hashed_slots(session, rays, slots, DEFAULT_HASH)
+        hierarchy = cls(session, rays, slots, arity, levels, bound)
         session.clock.forget()
         return hierarchy
 
@@ -144,7 +116,7 @@ class RayHierarchy:
         return spheres, cones
 
     def nodes(self, k):
-        """Level `k` as it is stored: (num_nodes, 10) float32, the columns the rows of cl/node.h."""
+        """Level `k` as it is stored: (num_nodes, 20) float32, the columns the rows of cl/node.h."""
         blocks = self.blocks[k].get().reshape(-1, NODE_ROWS, self.arity)
         return blocks.transpose(0, 2, 1).reshape(-1, NODE_ROWS)[: self.num_nodes[k]]
 
@@ -160,9 +132,8 @@ class RayHierarchy:
         return self.session.empty(self._padded(nodes) * NODE_ROWS, np.float32)
 
     def _launch(self, kernel, nodes, *args):
-        kernels = self.session.kernels("hierarchy.cl", ARITY=self.arity)
         size = -(-nodes // _PER_ITEM)
-        self.session.launch(HIERARCHY_CREATION, kernels[kernel], size, *args)
+        self.session.launch(HIERARCHY_CREATION, self._kernels[kernel], size, *args)
 
     def _build_leaves(self, rays):
         nodes = self._padded(self.num_nodes[0])
@@ -177,30 +148,15 @@ class RayHierarchy:
             self.blocks[0],
         )
 
-    def _build_level(self, level):
+    def _build_level(self, level, kernel, *children):
         nodes = self._padded(self.num_nodes[level])
         self.valid.append(self.session.empty(nodes, np.uint32))
         self._launch(
-            "build_parents",
+            kernel,
             nodes,
             np.uint32(self.num_nodes[level - 1]),
             np.uint32(nodes),
-            self.blocks[level - 1],
+            *children,
             self.blocks[level],
             self.valid[level],
         )
-
-
-def leaf_slots(session, rays):
-    """The leaves' order on the device, kept by the session: uploaded once per size."""
-    key = rays.size if rays.size is not None else len(rays)
-    cache = session.cache.setdefault("leaf_slots", {})
-    if key not in cache:
-        host = (
-            np.arange(len(rays), dtype=np.uint32)
-            if rays.size is None
-            else _screen_slots(*rays.size)
-        )
-        cache.clear()  # one order at a time: sizes change rarely
-        cache[key] = session.upload(HIERARCHY_CREATION, host)
-    return cache[key]

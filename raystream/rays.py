@@ -21,11 +21,14 @@ class Rays:
         Origin and tnear, direction and tfar. A ray with tfar < tnear is inactive: it hits nothing.
     size : (int, int) or None
         (width, height) where ray i belongs to pixel i of a screen, row by row from the top.
+    light : int or None
+        Of shadow rays that all start at one light: its number.
     """
 
     org_tnear: cla.Array
     dir_tfar: cla.Array
     size: tuple | None = None
+    light: int | None = None
 
     def __len__(self):
         return self.org_tnear.shape[0]

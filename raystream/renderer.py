@@ -8,7 +8,7 @@ from raystream import device as devices
 from raystream import image as images
 from raystream import intersect, rays
 from raystream.camera import Camera, check_size
-from raystream.checks import check_count
+from raystream.checks import check_choice, check_count
 from raystream.geometry import Geometry
 from raystream.host_tracer import HostTracer
 from raystream.intersect import HitStream
@@ -18,6 +18,7 @@ from raystream.shade import Shader
 from raystream.statistics import SHADING, Statistics
 from raystream.tracer import Tracer
 
+SHADOW, REFLECTION, REFRACTION = RAY_KINDS = ("shadow", "reflection", "refraction")
 # The R2 sequence (Roberts 2018): sample k of a pixel is frac(1/2 + k * these), sample 0 its centre.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
 
@@ -35,7 +36,10 @@ class Frame:
     geom_id, prim_id : (height, width) int32
         Of that hit, -1 where none.
     statistics : raystream.statistics.Statistics
-        Summed over all ray streams of the frame.
+        Summed over all ray streams of the frame, with the times of all stages.
+    kinds : dict of str to raystream.statistics.Statistics
+        The same by kind of ray, "shadow", "reflection" and "refraction", for kinds that had rays.
+        Stage times only where `Renderer.render` was asked for them.
     """
 
     image: np.ndarray
@@ -43,6 +47,7 @@ class Frame:
     geom_id: np.ndarray
     prim_id: np.ndarray
     statistics: Statistics
+    kinds: dict
 
     def save(self, path):
         """Write the image by suffix: .png and .jpg in sRGB, .exr and .npy linear."""
@@ -130,8 +135,16 @@ class Renderer:
         shadows=True,
         samples=1,
         progress=None,
+        stages_by_kind=False,
     ):
-        """Render one frame; parameters and result as for `raystream.render`."""
+        """Render one frame; parameters and result as for `raystream.render`.
+
+        Parameters
+        ----------
+        stages_by_kind : bool
+            Fill the stage times of `Frame.kinds`, too: of the tracer's work, not of making and
+            shading the rays. Waits for the device before and after every ray stream.
+        """
         camera = self.scene.camera if camera is None else camera
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: need a raystream.Camera, got {type(camera).__name__}")
@@ -140,7 +153,7 @@ class Renderer:
         check_count("samples", samples)
         if isinstance(self._tracer, Tracer):
             self._tracer.geometry(self._session)  # takes vertices updated since the last frame
-        statistics = Statistics(triangles=self.scene.num_triangles)
+        counts = _Counts(self._session, self.scene.num_triangles, stages_by_kind)
         self._session.clock.forget()
         image = self._session.empty((width * height, 4), np.float32)
         self._session.fill(SHADING, image, 0)
@@ -148,17 +161,17 @@ class Renderer:
         for sample in range(samples):
             offset = (0.5 + sample * _R2) % 1.0
             hits = self._sample(
-                camera, (width, height), offset, max_bounces, shadows, image, statistics
+                camera, (width, height), offset, max_bounces, shadows, image, counts
             )
             visible = visible or self._visible(hits)
-            statistics.add(Statistics(stages=self._session.finish()))
+            counts.take_stages()
             if progress is not None:
                 progress(sample + 1, samples)
         linear = image.get().reshape(height, width, 4)[..., :3] / np.float32(samples)
         visible = [field.reshape(height, width) for field in visible]
-        return Frame(np.ascontiguousarray(linear), *visible, statistics)
+        return Frame(np.ascontiguousarray(linear), *visible, counts.total, counts.kinds())
 
-    def _sample(self, camera, size, offset, max_bounces, shadows, image, statistics):
+    def _sample(self, camera, size, offset, max_bounces, shadows, image, counts):
         """Add one sample per pixel to the image; returns the primary hits."""
         session, shader = self._session, self._shader
         stream = rays.from_camera(session, camera, size, offset)
@@ -168,16 +181,16 @@ class Renderer:
         pending, bounce = [], 0
         while True:
             surfaces = shader.evaluate(hits, stream, weights, image)
-            self._light(stream, surfaces, weights, shadows, image, statistics)
+            self._light(stream, surfaces, weights, shadows, image, counts)
             if bounce < max_bounces:
-                spawned = shader.spawn(stream, surfaces, weights)
+                reflected, refracted = shader.spawn(stream, surfaces, weights)
                 # The reflection is taken up first; waiting streams stay few, a pair per bounce.
-                pending += [(r, w, bounce + 1) for r, w, alive in reversed(spawned) if alive]
+                spawned = ((REFRACTION, *refracted), (REFLECTION, *reflected))
+                pending += [(kind, r, w, bounce + 1) for kind, r, w, alive in spawned if alive]
             if not pending:
                 return primary
-            stream, weights, bounce = pending.pop()
-            hits = self._tracer.intersect_stream(session, stream)
-            statistics.add(self._tracer.statistics)
+            kind, stream, weights, bounce = pending.pop()
+            hits = counts.trace(kind, self._tracer, self._tracer.intersect_stream, stream)
 
     def _rasterize(self, camera, size, offset):
         hits = self._rasterizer.render(
@@ -185,12 +198,13 @@ class Renderer:
         )
         return HitStream(hits.t, hits.prim, hits.u, hits.v)
 
-    def _light(self, stream, surfaces, weights, shadows, image, statistics):
+    def _light(self, stream, surfaces, weights, shadows, image, counts):
         for light in range(self._shader.num_lights):
             shadow_rays = self._shader.shadow_rays(light, surfaces, weights, stream.size)
             if shadows:
-                blocked = self._tracer.occluded_stream(self._session, shadow_rays)
-                statistics.add(self._tracer.statistics)
+                blocked = counts.trace(
+                    SHADOW, self._tracer, self._tracer.occluded_stream, shadow_rays
+                )
             else:
                 blocked = intersect.not_blocked(self._session, len(stream))
             self._shader.add_light(light, blocked, stream, surfaces, weights, image)
@@ -198,6 +212,78 @@ class Renderer:
     def _visible(self, hits):
         geom_id, prim_id = intersect.split_ids(self._session, hits, self._geometry)
         return [hits.t.get(), geom_id.get(), prim_id.get()]
+
+
+class _Counts:
+    """The statistics of a frame, of all its ray streams and by kind of ray."""
+
+    def __init__(self, session, triangles, stages_by_kind):
+        self.total = Statistics(triangles=triangles)
+        self._session, self._stages_by_kind = session, stages_by_kind
+        self._by_kind = {kind: Statistics(triangles=triangles) for kind in RAY_KINDS}
+
+    def kinds(self):
+        """The statistics of the kinds that had rays."""
+        return {kind: counts for kind, counts in self._by_kind.items() if counts.rays}
+
+    def take_stages(self):
+        """Add the stage times since they were last taken; waits for the device."""
+        self.total.add(Statistics(stages=self._session.finish()))
+
+    def trace(self, kind, tracer, query, stream):
+        """What a tracer's query says about a stream of one kind of ray; adds what it counted."""
+        if self._stages_by_kind:
+            self.take_stages()  # of what came before the stream
+        answer = query(self._session, stream)
+        if self._stages_by_kind:
+            tracer.statistics.stages = self._session.finish()
+        for counts in (self.total, self._by_kind[kind]):
+            counts.add(tracer.statistics)
+        return answer
+
+
+def parse_method(text, known):
+    """A method with options as the command line writes it: "rsh:arity=8:levels=none".
+
+    Parameters
+    ----------
+    text : str
+        The name, then any number of ":key=value". Values are whole numbers, numbers, true, false
+        or none; anything else stays text.
+    known : sequence of str
+        The names that there are.
+
+    Returns
+    -------
+    str, dict
+        The name; the options, whose keys are the method's to check.
+
+    Raises
+    ------
+    ValueError
+        An unknown name (with the list), a part that is not key=value, a key given twice.
+    """
+    name, *parts = text.split(":")
+    check_choice("method", name, known)
+    options = {}
+    for part in parts:
+        key, equals, value = part.partition("=")
+        if not (key and equals) or key in options:
+            raise ValueError(f"method {name!r}: need key=value, each key once, got {part!r}")
+        options[key] = _value(value)
+    return name, options
+
+
+def _value(text):
+    words = {"true": True, "false": False, "none": None}
+    if text.lower() in words:
+        return words[text.lower()]
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            pass  # the next kind
+    return text
 
 
 def _tracer(scene, method, device, options):

@@ -13,7 +13,8 @@ of the batches' counts is what one batch would have counted.
 from raystream import intersect
 from raystream.checks import check_choice, check_count
 from raystream.errors import MemoryLimitError
-from raystream.hierarchy import ARITIES, RayHierarchy, leaf_slots
+from raystream.hierarchy import ARITIES, BOUNDS, RayHierarchy
+from raystream.order import leaf_slots
 from raystream.pairs import FUSED, LOADED, PAIR_BYTES, REDUCTIONS, bytes_per_pair
 from raystream.statistics import Statistics
 from raystream.traverse import Traversal
@@ -41,6 +42,9 @@ class RayspaceTracer:
         How survivors become the next stream: "fused" writes them straight to their place; the
         others write all children out first and reduce that stream by the method (see
         `stream.reduce`), as the paper does, to show what it costs.
+    bound : {"tight", "paper"}
+        How nodes are united: "paper" as Reis et al. (2017) print it, without the rays' tfar; to
+        reproduce counts (cl/paper_bounds.h).
 
     Raises
     ------
@@ -49,14 +53,23 @@ class RayspaceTracer:
     """
 
     def __init__(
-        self, session, geometry, memory_limit, arity=4, levels=None, reduction=FUSED
+        self,
+        session,
+        geometry,
+        memory_limit,
+        arity=4,
+        levels=None,
+        reduction=FUSED,
+        bound="tight",
     ):
         check_choice("arity", arity, ARITIES)
+        check_choice("bound", bound, BOUNDS)
         check_choice("reduction", reduction, REDUCTIONS)
         if levels is not None:
             check_count("levels", levels)
         self.session, self.geometry = session, geometry
         self._arity, self._levels, self._reduction = arity, levels, reduction
+        self._bound, self._test_rays = bound, levels is None
         self._limit, self._bytes_per_pair = memory_limit, bytes_per_pair(arity, reduction)
         fused = reduction == FUSED
         self._most_pairs = min(
@@ -79,21 +92,38 @@ class RayspaceTracer:
         return blocked, self._trace("occlude_pairs", rays, blocked)
 
     def _trace(self, kernel, rays, result):
-        slots = leaf_slots(self.session, rays)
-        hierarchy = RayHierarchy(self.session, rays, slots, self._arity, self._levels)
+        slots = self._slots(rays)
+        hierarchy = RayHierarchy(
+            self.session, rays, slots, self._arity, self._levels, self._bound, self._test_rays
+        )
         self._check_room(hierarchy)
+        objects = self._objects()
         batches = [(0, self.geometry.num_triangles)]
-        totals, done, peak = None, 0, 0
+        statistics, totals = Statistics(triangles=self.geometry.num_triangles), 0
         while batches:
             first, last = batches.pop()
-            counts, overflow = self._run_batch(kernel, rays, hierarchy, result, first, last)
+            traversal = self._run_batch(kernel, rays, hierarchy, objects, result, first, last)
+            overflow = int(traversal.reduction.overflow.get()[0])
             if overflow:
                 batches += self._cut(first, last, overflow)
                 continue
-            done += 1
-            totals = counts if totals is None else totals + counts
-            peak = max(peak, self._stream_bytes(counts))
-        return self._statistics(hierarchy, totals, done, peak)
+            counts = traversal.counts.get()
+            totals = totals + counts
+            statistics.batches += 1
+            statistics.mesh_tests += int(traversal.object_tests.get()[0])
+            statistics.peak_stream_bytes = max(
+                statistics.peak_stream_bytes, self._stream_bytes(counts)
+            )
+        self._count(statistics, hierarchy, totals)
+        return statistics
+
+    def _slots(self, rays):
+        """The order of the rays in the leaves."""
+        return leaf_slots(self.session, rays)
+
+    def _objects(self):
+        """Parts of the scene to test before their triangles."""
+        return None
 
     def _check_room(self, hierarchy):
         """A batch of one triangle must fit: at most one pair per leaf."""
@@ -104,11 +134,16 @@ class RayspaceTracer:
                 f"got {self._limit} (at most {self._most_pairs} pairs per stream on this device)"
             )
 
-    def _run_batch(self, kernel, rays, hierarchy, result, first, last):
-        """One batch of triangles; returns (counts, survivors of a level that did not fit)."""
-        test_rays = self._levels is None
+    def _run_batch(self, kernel, rays, hierarchy, objects, result, first, last):
+        """One batch of triangles, positions first .. last; returns its `Traversal`."""
         traversal = Traversal(
-            self.session, self.geometry, hierarchy, self._capacity, test_rays, self._reduction
+            self.session,
+            self.geometry,
+            hierarchy,
+            self._capacity,
+            self._test_rays,
+            self._reduction,
+            objects,
         )
         pairs = traversal.run(first, last)
         intersect.test_pairs(
@@ -122,7 +157,7 @@ class RayspaceTracer:
             result,
             traversal,
         )
-        return traversal.counts.get(), int(traversal.reduction.overflow.get()[0])
+        return traversal
 
     def _cut(self, first, last, survivors):
         """The batches that replace one that overflowed; the streams grow first, up to the limit."""
@@ -144,19 +179,12 @@ class RayspaceTracer:
             for a, b in zip(inputs, following, strict=True)
         )
 
-    def _statistics(self, hierarchy, totals, batches, peak):
+    def _count(self, statistics, hierarchy, totals):
         nodes = hierarchy.count_nodes()
-        order = nodes[::-1] if self._levels is None else nodes[:0:-1]
-        levels = [
+        order = nodes[::-1] if self._test_rays else nodes[:0:-1]
+        statistics.rays = nodes[0]
+        statistics.levels = [
             {"nodes": n, "tests": int(t), "hits": int(h), "misses": int(t - h)}
             for n, (t, h) in zip(order, totals[:-1, :2], strict=True)
         ]
-        return Statistics(
-            levels=levels,
-            final_tests=int(totals[-1, 0]),
-            final_hits=int(totals[-1, 1]),
-            rays=nodes[0],
-            triangles=self.geometry.num_triangles,
-            peak_stream_bytes=peak,
-            batches=batches,
-        )
+        statistics.final_tests, statistics.final_hits = (int(n) for n in totals[-1, :2])

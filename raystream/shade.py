@@ -66,6 +66,8 @@ class Shader:
             self._upload(srgb_to_linear(np.arange(256, dtype=np.uint8)).astype(np.float32)),
         ]
         self._lights = [self._upload(_light_record(light)) for light in scene.lights]
+        # A directional light is nowhere: its shadow rays start at the surfaces.
+        self._from_light = [not isinstance(light, DirectionalLight) for light in scene.lights]
 
     @property
     def num_lights(self):
@@ -99,7 +101,8 @@ class Shader:
     def shadow_rays(self, light, surfaces, weights, size):
         """Rays between the light of that number and every surface that faces it."""
         count = weights.shape[0]
-        rays = Rays(*(self.session.empty((count, 4), np.float32) for _ in range(2)), size)
+        arrays = (self.session.empty((count, 4), np.float32) for _ in range(2))
+        rays = Rays(*arrays, size, light if self._from_light[light] else None)
         self._launch(
             RAY_CREATION,
             "make_shadow_rays",

@@ -16,7 +16,7 @@ _CHUNKS_PER_UNIT = 4
 _TYPES = {4: "uint", 8: "ulong"}
 
 
-def sort_by_key(session, keys, values, bits):
+def sort_by_key(session, keys, values, bits, length=None):
     """Keys in ascending order by their lowest `bits` bits, and values in the order of their keys.
 
     Parameters
@@ -25,6 +25,9 @@ def sort_by_key(session, keys, values, bits):
     keys : Array of shape (n,) uint32 or uint64
     values : Array of shape (n,), 4 or 8 bytes an element, or None
     bits : int
+    length : Array of shape (1,) uint32, optional
+        How many elements there are, where only the device knows: the first `length` are sorted,
+        the rest of the result means nothing. Default: all n.
 
     Returns
     -------
@@ -36,8 +39,11 @@ def sort_by_key(session, keys, values, bits):
     passes = -(-bits // (_BUFFERED_DIGIT_BITS if buffered else _DIGIT_BITS))
     if passes == 0 or keys.size == 0:
         return [None if array is None else array.copy() for array in (keys, values)]
+    if length is None:
+        length = session.empty(1, np.uint32)
+        session.fill(STREAM_REDUCTION, length, keys.size)
     source = _Elements(keys, values)
-    run = _Passes(session, source, bits, -(-bits // passes), buffered)
+    run = _Passes(session, source, length, bits, -(-bits // passes), buffered)
     for step in range(passes):
         source = run.scatter(source, step, last=step == passes - 1)
     return source.keys, source.values
@@ -53,8 +59,9 @@ class _Elements:
 
 
 class _Passes:
-    def __init__(self, session, elements, bits, digit_bits, buffered):
+    def __init__(self, session, elements, length, bits, digit_bits, buffered):
         self.session, self.bits, self.digit_bits = session, bits, digit_bits
+        self.length = length
         self.keys, self.values = elements.keys, elements.values
         self.chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
         self.counts = session.empty(self.chunks << digit_bits, np.uint32)
@@ -78,20 +85,20 @@ class _Passes:
         else:
             target = self._apart(count)
         kernels = self._kernels(source, target, step)
-        n, counts = np.uint64(count), self.counts
+        length, counts = self.length, self.counts
 
         def launch(kernel, size, *args):
             self.session.launch(STREAM_REDUCTION, kernels[kernel], size, *args)
 
-        launch("count_digits", self.chunks, n, shift, source.keys, source.packed, counts)
+        launch("count_digits", self.chunks, length, shift, source.keys, source.packed, counts)
         launch("scan_digits", 1, counts)
         sources, targets = (source.keys, source.values), (target.keys, target.values)
         if self.lines is None:
             args = *sources, source.packed, counts, *targets, target.packed
-            launch("scatter_digits", self.chunks, n, shift, *args)
+            launch("scatter_digits", self.chunks, length, shift, *args)
         else:
             args = *sources, counts, self.lines.keys, self.lines.values, *targets
-            launch("scatter_lines", self.chunks, n, shift, *args)
+            launch("scatter_lines", self.chunks, length, shift, *args)
         return target
 
     def _kernels(self, source, target, step):

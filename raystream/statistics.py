@@ -1,11 +1,15 @@
 """What a call counted and how long its stages took (the tables of the papers)."""
 
+import contextlib
 import dataclasses
 
 # Stage names, as in the papers.
 GEOMETRY = "geometry"
 RASTERISATION = "rasterisation"
 RAY_CREATION = "ray creation"
+COMPRESSION = "compression"
+SORTING = "sorting"
+DECOMPRESSION = "decompression"
 HIERARCHY_CREATION = "hierarchy creation"
 TRAVERSAL = "traversal"
 STREAM_REDUCTION = "stream reduction"
@@ -85,10 +89,23 @@ class StageClock:
 
     def __init__(self):
         self._events = []
+        self._user = None
 
     def record(self, stage, event):
-        """Note that `event` belongs to `stage`."""
-        self._events.append((stage, event))
+        """Note that `event` belongs to `stage`, or to the stage it is `under`."""
+        self._events.append((self._user or stage, event))
+
+    @contextlib.contextmanager
+    def under(self, stage):
+        """File all that is recorded inside under `stage`: for primitives that a stage uses.
+
+        Of nested ones the innermost decides.
+        """
+        outer, self._user = self._user, stage
+        try:
+            yield
+        finally:
+            self._user = outer
 
     def forget(self):
         """Drop what has been recorded: for calls whose times nobody asks for."""

@@ -12,12 +12,13 @@ from raystream import device as devices
 from raystream import intersect, rays
 from raystream.brute import Brute
 from raystream.checks import as_float_array, check_choice, check_count, check_rows
+from raystream.crsh import CoherentTracer
 from raystream.geometry import Geometry
 from raystream.rsh import RayspaceTracer
 from raystream.scene import as_scene
 from raystream.statistics import Statistics
 
-_METHODS = {"brute": Brute, "rsh": RayspaceTracer}
+_METHODS = {"brute": Brute, "rsh": RayspaceTracer, "crsh": CoherentTracer}
 _COMMON = ("self", "session", "geometry", "memory_limit")
 # The default memory_limit: a part of the device's memory, and no more than needed to be fast.
 _MEMORY_SHARE = 4
@@ -66,7 +67,7 @@ class Tracer:
         Bytes that the candidates of one call may take; default: 1 GiB, or a quarter of the device's
         memory where that is less.
     **options
-        Of the method: see `raystream.rsh.RayspaceTracer`.
+        Of the method: see `raystream.rsh.RayspaceTracer`, `raystream.crsh.CoherentTracer`.
 
     Attributes
     ----------

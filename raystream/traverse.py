@@ -23,21 +23,35 @@ class Traversal:
         ray-space hierarchy's paper, or the pairs of level 1 are handed on.
     reduction : str
         One of `pairs.REDUCTIONS`.
+    objects : raystream.objects.Objects, optional
+        Parts of the scene whose bounding spheres the top level is tested against first.
 
     Attributes
     ----------
     counts : Array of shape (levels + 1, 3) uint64
         Per level, top first, and last the final tests: tests, hits, input stream length.
+    object_tests : Array of shape (1,) uint64
+        Tests of top-level nodes against the objects' spheres.
     """
 
-    def __init__(self, session, geometry, hierarchy, capacity, test_rays, reduction):
+    def __init__(
+        self, session, geometry, hierarchy, capacity, test_rays, reduction, objects=None
+    ):
         self.session, self.geometry, self.hierarchy = session, geometry, hierarchy
-        self._kernels = session.kernels("traverse.cl", ARITY=hierarchy.arity, CHUNKS=CHUNKS)
+        self._objects = objects
+        defines = {} if objects is None else {"OBJECTS": 1}
+        if hierarchy.bound == "paper":
+            defines["PAPER_BOUNDS"] = 1
+        self._kernels = session.kernels(
+            "traverse.cl", ARITY=hierarchy.arity, CHUNKS=CHUNKS, **defines
+        )
         self.reduction = make_reduction(session, hierarchy.arity, reduction, capacity)
         self._last = 0 if test_rays else 1
         self.levels = list(range(hierarchy.num_levels, self._last - 1, -1))
         self.counts = session.empty((len(self.levels) + 1, COUNTS), np.uint64)
         session.fill(TRAVERSAL, self.counts, 0)
+        self.object_tests = session.empty(1, np.uint64)
+        session.fill(TRAVERSAL, self.object_tests, 0)
         self._streams = [PairStream.empty(session, capacity) for _ in range(2)]
         self._masks = session.empty(capacity + LOADED, np.uint8)
 
@@ -47,7 +61,10 @@ class Traversal:
         return self.hierarchy.arity**self._last
 
     def run(self, first, last):
-        """The stream of (node, triangle) pairs that survive all levels, triangles first..last."""
+        """The stream of (node, triangle) pairs that survive all levels.
+
+        Of the triangles, or the objects' order of them, positions first .. last.
+        """
         target = self._streams[0]
         self._top(first, last, target)
         for row in range(1, len(self.levels)):
@@ -56,20 +73,26 @@ class Traversal:
         return target
 
     def _top(self, first, last, target):
-        level = self.levels[0]
+        level, reduction, objects = self.levels[0], self.reduction, self._objects
+        scene = self.geometry if objects is None else objects
         args = (
             np.uint32(self.hierarchy.num_nodes[level]),
             np.uint32(first),
             np.uint32(last),
             self.hierarchy.blocks[level],
-            self.geometry.sphere_rows,
+            scene.bound_rows,
         )
-        reduction = self.reduction
-        chunks = (reduction.chunk_tests, reduction.chunk_hits)
-        self._launch("count_top", *args, *chunks)
+        culling = () if objects is None else self._object_arguments()
+        chunks = reduction.chunk_tests, reduction.chunk_hits
+        self._launch("count_top", *args, *chunks, self.object_tests, *culling)
         tasks = self.hierarchy.num_nodes[level] * (last - first)
         reduction.scan(None, target, self.counts, 0, tasks)
-        self._launch("write_top", *args, reduction.offsets, target.length, target.pairs)
+        self._launch("write_top", *args, reduction.offsets, target.length, target.pairs, *culling)
+
+    def _object_arguments(self):
+        objects = self._objects
+        number = np.uint32(objects.num_objects)
+        return number, objects.object_rows, objects.ranges, objects.order
 
     def _level(self, row, source, target):
         level, reduction = self.levels[row], self.reduction
@@ -79,7 +102,7 @@ class Traversal:
             source.pairs,
             self.hierarchy.blocks[level],
             self.hierarchy.valid[level + 1],
-            self.geometry.spheres,
+            self.geometry.bounds,
             self._masks,
             reduction.chunk_tests,
             reduction.chunk_hits,

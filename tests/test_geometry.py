@@ -1,10 +1,13 @@
-"""Triangles and their bounding spheres on the device."""
+"""Triangles and their bounds on the device."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from soup import mesh_of, triangle_soup
 
 import raystream as rs
+from raystream import device
 from raystream.geometry import Geometry
 
 COUNTS = [1, 2, 15, 16, 17, 31, 33, 1009]
@@ -12,11 +15,44 @@ COUNTS = [1, 2, 15, 16, 17, 31, 33, 1009]
 
 def spheres_of(geometry):
     """The spheres of the triangles and of the padding, float64; both layouts hold the same."""
-    spheres = geometry.spheres.get()
-    rows = geometry.sphere_rows.get().transpose(0, 2, 1).reshape(-1, 4)
-    np.testing.assert_array_equal(spheres, rows)
-    spheres = spheres.astype(np.float64)
+    spheres = bounds_of(geometry)[:, :4]
     return spheres[: geometry.num_triangles], spheres[geometry.num_triangles :]
+
+
+def bounds_of(geometry):
+    """All bounds, (n, 12) float64; both layouts hold the same."""
+    bounds = geometry.bounds.get()
+    rows = geometry.bound_rows.get().transpose(0, 2, 1).reshape(-1, 12)
+    np.testing.assert_array_equal(bounds, rows)
+    return bounds.astype(np.float64)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([1e-3, 1.0, 1e3]),
+    st.sampled_from([0.0, 100.0]),
+    st.sampled_from([1.0, 1e-3, 1e-6, 0.0]),  # from round triangles to lines
+)
+def test_slabs_and_boxes_hold_their_triangles(seed, scale, offset, thinness):
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(50, 3, 3))
+    corners[:, 2] = corners[:, 0] + 0.7 * (corners[:, 1] - corners[:, 0]) + thinness * corners[:, 2]
+    corners = (scale * corners + offset).astype(np.float32)
+    geometry = Geometry(device.session(), rs.Scene([mesh_of("soup", corners)]))
+    bounds = bounds_of(geometry)[:50, None]
+    away = corners.astype(np.float64) - bounds[..., :3]
+    # Where there is no normal the slab has no end.
+    distances = np.abs((away * bounds[..., 4:7]).sum(axis=2))
+    assert (distances <= bounds[..., 7]).all()
+    assert (np.abs(away) <= bounds[..., 8:11]).all() and (bounds[..., 11] == 0).all()
+    with_normal = np.isfinite(bounds[:, 0, 7])
+    np.testing.assert_allclose(
+        np.linalg.norm(bounds[with_normal, 0, 4:7], axis=1), 1.0, rtol=1e-6
+    )
+    if thinness == 1.0:
+        thickness = bounds[:, 0, 7] / bounds[:, 0, 3]
+        assert with_normal.all() and (thickness < 1e-3 * (1 + offset / scale)).all()
 
 
 @pytest.mark.parametrize("count", COUNTS)

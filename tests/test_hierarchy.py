@@ -1,4 +1,4 @@
-"""The ray-space hierarchy: the order of its leaves, and that every node bounds its rays."""
+"""The ray-space hierarchy: every node bounds its rays."""
 
 import numpy as np
 import pytest
@@ -8,30 +8,10 @@ from soup import random_rays
 
 import raystream as rs
 from raystream import device, rays
-from raystream.hierarchy import screen_slots
+from raystream.hierarchy import BOUNDS
 
 INVALID = 0xFFFFFFFF
 COUNTS = [1, 2, 3, 4, 5, 15, 16, 17, 63, 64, 65, 1009]
-
-
-@pytest.mark.parametrize("size", [(1, 1), (8, 8), (7, 5), (9, 8), (64, 64), (100, 37), (512, 3)])
-def test_every_pixel_is_one_leaf(size):
-    slots = screen_slots(*size)
-    assert len(slots) % 64 == 0
-    np.testing.assert_array_equal(np.sort(slots[slots != INVALID]), np.arange(size[0] * size[1]))
-
-
-@pytest.mark.parametrize("k", [1, 2, 3, 4, 5])
-def test_powers_of_four_leaves_are_squares(k):
-    y, x = np.divmod(screen_slots(32, 32).reshape(-1, 4**k), 32)
-    for axis in (x, y):
-        assert (np.ptp(axis, axis=1) == 2**k - 1).all()
-        assert (axis.min(axis=1) % 2**k == 0).all()
-
-
-def test_eight_leaves_are_four_by_two():
-    y, x = np.divmod(screen_slots(64, 64).reshape(-1, 8), 64)
-    assert (np.ptp(x, axis=1) == 3).all() and (np.ptp(y, axis=1) == 1).all()
 
 
 def stream(origins, directions, tfar=np.inf):
@@ -43,9 +23,14 @@ def assert_bounds(hierarchy, origins, directions, tfar):
     length = np.linalg.norm(directions.astype(np.float64), axis=1)
     unit = directions / length[:, None]
     active = tfar >= 0
+    slots = hierarchy.slots.get()
+    held = np.flatnonzero(slots < len(origins))
+    slot_of_ray = np.zeros(len(origins), np.int64)
+    slot_of_ray[slots[held]] = held
+    assert np.isin(np.flatnonzero(active), slots).all()
     for k in range(hierarchy.num_levels + 1):
         nodes = hierarchy.nodes(k).astype(np.float64)
-        of_ray = np.arange(len(origins)) // hierarchy.arity**k
+        of_ray = slot_of_ray // hierarchy.arity**k
         centre, radius, axis, cosine, sine, reach = np.split(
             nodes[of_ray], [3, 4, 7, 8, 9], axis=1
         )
@@ -62,12 +47,15 @@ def assert_bounds(hierarchy, origins, directions, tfar):
         np.testing.assert_array_equal(nodes[:, 9] >= 0, holds_ray)
 
 
+@pytest.mark.parametrize("order", ["screen", "hash"])
+@pytest.mark.parametrize("bound", BOUNDS)
 @pytest.mark.parametrize("arity", [4, 8])
 @pytest.mark.parametrize("count", COUNTS)
-def test_nodes_bound_their_rays(rng, arity, count):
+def test_nodes_bound_their_rays(rng, order, bound, arity, count):
     origins, directions = random_rays(rng, count)
     tfar = np.where(rng.random(count) < 0.3, -1.0, rng.random(count) * 3).astype(np.float32)
-    hierarchy = rs.RayHierarchy.build(stream(origins, directions, tfar), arity=arity)
+    rays_given = stream(origins, directions, tfar)
+    hierarchy = rs.RayHierarchy.build(rays_given, arity, order=order, bound=bound)
     assert hierarchy.num_nodes[-1] == 1
     assert_bounds(hierarchy, origins, directions, tfar)
     levels = [hierarchy.nodes(k) for k in range(hierarchy.num_levels + 1)]
@@ -80,23 +68,26 @@ def test_nodes_bound_their_rays(rng, arity, count):
     st.floats(0, 4),
     st.floats(0, 4),
     st.sampled_from([1e-4, 1.0, 1e5]),
+    st.sampled_from(BOUNDS),
 )
-def test_nodes_bound_bundles_of_any_spread(seed, angular, spatial, scale):
+def test_nodes_bound_bundles_of_any_spread(seed, angular, spatial, scale, bound):
     rng = np.random.default_rng(seed)
     base = rng.normal(size=3)
     directions = base / np.linalg.norm(base) + angular * rng.normal(size=(64, 3))
     origins = scale * (rng.normal(size=3) + spatial * rng.normal(size=(64, 3)))
     origins, directions = origins.astype(np.float32), directions.astype(np.float32)
     tfar = np.full(64, np.inf, np.float32)
-    assert_bounds(rs.RayHierarchy.build(stream(origins, directions)), origins, directions, tfar)
+    hierarchy = rs.RayHierarchy.build(stream(origins, directions), bound=bound)
+    assert_bounds(hierarchy, origins, directions, tfar)
 
 
-def test_parallel_opposite_and_tiny_directions():
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_parallel_opposite_and_tiny_directions(bound):
     directions = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]] * 4, np.float32)
     directions[4:8] *= 1e-30
     directions[8] = [0, 0, -1]
     origins = np.zeros((16, 3), np.float32)
-    hierarchy = rs.RayHierarchy.build(stream(origins, directions))
+    hierarchy = rs.RayHierarchy.build(stream(origins, directions), bound=bound)
     assert_bounds(hierarchy, origins, directions, np.full(16, np.inf, np.float32))
     parallel, tiny, opposite, _ = hierarchy.nodes(1)
     assert parallel[8] < 1e-6 and tiny[8] < 1e-6 and opposite[7] <= 0
@@ -105,11 +96,28 @@ def test_parallel_opposite_and_tiny_directions():
 @pytest.mark.parametrize(
     ("option", "message"),
     [({"arity": 3}, "arity: need one of 4, 8, got 3"), ({"levels": 0}, "levels"),
-     ({"order": "hilbert"}, "order")],
+     ({"order": "hilbert"}, "order"), ({"bound": "loose"}, "bound")],
 )  # fmt: skip
 def test_options_that_there_are_not(option, message):
     with pytest.raises(ValueError, match=message):
         rs.RayHierarchy.build(stream(np.zeros((4, 3)), np.ones((4, 3))), **option)
+
+
+def test_the_bounds_of_the_paper_are_its_unions():
+    """Two rays share the cone between them; two spheres lie in that around the middle."""
+    origins = np.array([[0, 0, 0], [2, 0, 0], [4, 0, 0], [6, 0, 0]] * 2, np.float32)
+    angles = np.radians([0, 40, 40, 40, 10, 10, 10, 50])
+    directions = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+    hierarchy = rs.RayHierarchy.build(stream(origins, directions), bound="paper")
+    spheres, cones = hierarchy.level(1)
+    # Middles of middles: (0, 2) -> 1, radius 1; with 4 -> 2.5, 1.5 + 1; with 6 -> 4.25, 1.75 + 2.5.
+    np.testing.assert_allclose(spheres[:, [0, 3]], [[4.25, 4.25]] * 2, rtol=1e-5)
+    np.testing.assert_allclose(np.degrees(cones[:, 3]), [20, 20], atol=1e-3)
+    root = hierarchy.level(2)[1][0]
+    middle = np.radians(25)  # of the axes at 20 and 30 degrees; 5 + max(20, 20) wide
+    np.testing.assert_allclose(root[:3], [np.sin(middle), 0, np.cos(middle)], atol=1e-5)
+    np.testing.assert_allclose(np.degrees(root[3]), 25, atol=1e-3)
+    assert (hierarchy.nodes(1)[:, 9] == np.inf).all()  # tfar is not known to them
 
 
 def test_levels_can_be_inspected():

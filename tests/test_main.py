@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import raystream as rs
 from raystream import __main__ as cli
 
 
@@ -56,6 +57,43 @@ def test_compare_prints_the_table_and_writes_pictures(capsys, tmp_path):
     assert {"rsh", "brute", "embree"} <= rows
 
 
+def test_methods_take_options(capsys, tmp_path):
+    code, out, _ = run(
+        capsys, "compare", "cornell:mirrors", "--methods", "rsh:arity=8:levels=2, rsh", "--size",
+        "24x24", "-o", tmp_path,
+    )  # fmt: skip
+    assert code == 0
+    assert {line.split()[0] for line in out.splitlines() if line} >= {"rsh:arity=8:levels=2", "rsh"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "rsh-arity-8-levels-2.png", "rsh-arity-8-levels-2-difference.png", "rsh.png",
+        "rsh-difference.png", "reference.png", "side-by-side.png",
+    }  # fmt: skip
+
+
+def test_render_takes_options_of_the_method(capsys, tmp_path):
+    code, out, _ = run(
+        capsys, "render", "cornell", "-o", tmp_path / "a.png", "--size", "16x16", "--method",
+        "rsh:arity=8", "--verify",
+    )  # fmt: skip
+    assert code == 0
+    assert "rays, rsh:arity=8" in out.splitlines()[0]
+    assert sum(line.startswith("rsh:arity=8 ") for line in out.splitlines()) == 1 + 3
+
+
+def test_counts_are_printed_where_asked(capsys):
+    arguments = ("compare", "cornell", "--methods", "rsh:arity=8:levels=2,rsh", "--size", "48x48")
+    plain, counted = run(capsys, *arguments), run(capsys, *arguments, "--counts")
+    assert plain[0] == counted[0] == 0
+    frame = rs.render(rs.scenes.cornell(), size=(48, 48), arity=8, levels=2)
+    lines, shadows = counted[1].splitlines(), frame.kinds["shadow"]
+    assert f"rsh:arity=8:levels=2: {shadows.rays:,} rays x 32 triangles" in lines
+    top = shadows.levels[0]
+    row = ["level", "2", *(f"{top[key]:,}" for key in ("nodes", "tests", "misses", "hits"))]
+    assert row in [line.split() for line in lines]
+    assert "shadow rays" not in plain[1] and "level 2" not in plain[1]
+    assert len(lines) > len(plain[1].splitlines())
+
+
 def test_a_failed_check_is_exit_code_1(capsys, monkeypatch):
     from raystream import compare
 
@@ -87,7 +125,13 @@ def test_devices_marks_the_default(capsys):
     (["render", "cornell", "-o", "a.png", "--samples", "0"], "samples"),
     (["render", "cornell:heavy", "-o", "a.png"], "variant"),
     (["render", "rings:0", "-o", "a.png"], "size"),
-    (["compare", "cornell", "--methods", "rsh,fast"], "--methods: need some of"),
+    (["render", "cornell", "-o", "a.png", "--method", "rsh:arity"], "need key=value"),
+    (["render", "cornell", "-o", "a.png", "--method", "rsh:arity=5"], "arity: need one of 4, 8"),
+    (["render", "cornell", "-o", "a.png", "--method", "rsh:leaf=2"], "its options: arity, levels"),
+    (["compare", "cornell", "--methods", "rsh,fast"], "'embree', got 'fast'"),
+    (["compare", "cornell", "--methods", "rsh:arity"], "need key=value"),
+    (["compare", "cornell", "--methods", "brute:arity=8"], "its options: none"),
+    (["compare", "cornell", "--methods", "embree:arity=8"], "'embree' has no options, got arity"),
     (["compare", "cornell", "--methods", ","], "--methods: need some of"),
     (["render", "demo:3", "-o", "a.png"], "scene 'demo' takes no argument"),
     (["render", "demo", "-o", "gone/a.png"], "no such folder"),
@@ -106,3 +150,4 @@ def test_every_command_has_examples(capsys):
     for command in ("render", "compare"):
         code, out, _ = run(capsys, command, "--help")
         assert code == 0 and f"raystream {command} " in out and "examples:" in out
+    assert "--counts" in out.split("examples:")[1]

@@ -7,6 +7,7 @@ from raystream.baselines import EmbreeTracer, render_reference
 from raystream.baselines.tolerance import psnr, ssim
 
 import raystream as rs
+from raystream.renderer import RAY_KINDS, parse_method
 
 HEAD_ON = rs.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y=20)
 SKY = np.array([0.2, 0.3, 0.4])
@@ -181,6 +182,97 @@ def test_statistics_and_stages_of_a_frame():
                                   "stream reduction", "final intersection", "shading",
                                   "rasterisation"}  # fmt: skip
     assert rs.render(rs.scenes.cornell("mirrors"), size=(64, 64)).statistics.levels == counts.levels
+
+
+COUNTS = ("rays", "mesh_tests", "final_tests", "final_hits", "total_tests")
+
+
+@pytest.mark.parametrize("options", [{}, {"arity": 8, "levels": 2}, {"method": "brute"}], ids=str)
+def test_the_kinds_of_ray_add_up_to_the_frame(options):
+    frame = rs.render(rs.scenes.demo(), size=(48, 32), max_bounces=3, samples=2, **options)
+    kinds = frame.kinds.values()
+    assert tuple(frame.kinds) == RAY_KINDS
+    for name in COUNTS:
+        assert sum(getattr(k, name) for k in kinds) == getattr(frame.statistics, name), name
+    for i, level in enumerate(frame.statistics.levels):
+        assert level == {key: sum(k.levels[i][key] for k in kinds) for key in level}
+    assert all(k.triangles == frame.statistics.triangles and not k.stages for k in kinds)
+
+
+def test_rays_are_counted_by_their_kind():
+    mirror, glass = {"diffuse": 0.0, "reflectivity": 1.0}, {"diffuse": 1.0, "transmission": 1.0}
+    meshes = [square(z=-1.0, **mirror), square(half=0.3, **glass)]
+    scene = rs.Scene(meshes, [], HEAD_ON)
+    kinds = rs.render(scene, size=(9, 9), max_bounces=1).kinds
+    assert {kind: counts.rays for kind, counts in kinds.items()} == {
+        "reflection": 9 * 9,
+        "refraction": 3 * 3,
+    }
+
+
+def test_kinds_without_rays_are_left_out():
+    options = {"size": (16, 16), "max_bounces": 2}
+    assert list(rs.render(rs.scenes.cornell(), **options).kinds) == ["shadow"]
+    mirrors = rs.scenes.cornell("mirrors")
+    assert list(rs.render(mirrors, shadows=False, **options).kinds) == ["reflection"]
+    assert rs.render(rs.scenes.cornell(), shadows=False, **options).kinds == {}
+
+
+def test_embree_has_kinds_too():
+    scene = rs.scenes.demo()
+    ours, theirs = (
+        rs.render(scene, method=method, size=(32, 24)).kinds
+        for method in ("rsh", EmbreeTracer.from_scene(scene))
+    )
+    assert {k: c.rays for k, c in theirs.items()} == {k: c.rays for k, c in ours.items()}
+
+
+def test_stage_times_by_kind_where_asked():
+    renderer = rs.Renderer(rs.scenes.demo())
+    plain = renderer.render(size=(48, 32))
+    timed = renderer.render(size=(48, 32), stages_by_kind=True)
+    np.testing.assert_array_equal(timed.image, plain.image)
+    assert set(timed.statistics.stages) == set(plain.statistics.stages)
+    for kind, counts in timed.kinds.items():
+        assert counts.levels == plain.kinds[kind].levels
+        assert {"hierarchy creation", "traversal", "final intersection"} <= set(counts.stages)
+        assert not {"ray creation", "shading", "rasterisation"} & set(counts.stages)
+    traversals = [counts.stages["traversal"]["device"] for counts in timed.kinds.values()]
+    np.testing.assert_allclose(sum(traversals), timed.statistics.stages["traversal"]["device"])
+
+
+@pytest.mark.parametrize("by_kind", [False, True])
+def test_a_frame_waits_for_its_times_once_per_sample(session, monkeypatch, by_kind):
+    renderer, waits, finish = rs.Renderer(rs.scenes.demo()), [], session.finish
+    monkeypatch.setattr(session, "finish", lambda: waits.append(1) or finish())
+    renderer.render(size=(16, 16), samples=3, stages_by_kind=by_kind)
+    assert (len(waits) == 3) != by_kind
+
+
+@pytest.mark.parametrize(("text", "options"), [
+    ("rsh", {}),
+    ("rsh:arity=8:levels=2", {"arity": 8, "levels": 2}),
+    ("rsh:levels=none:a=true:b=False", {"levels": None, "a": True, "b": False}),
+    ("rsh:a=0.5:b=-3:c=1e3:d=paper:e=", {"a": 0.5, "b": -3, "c": 1000.0, "d": "paper", "e": ""}),
+    ("rsh:a=b=c", {"a": "b=c"}),
+])  # fmt: skip
+def test_a_method_with_options_as_text(text, options):
+    name, parsed = parse_method(text, rs.methods())
+    assert (name, parsed) == ("rsh", options)
+    assert [type(value) for value in parsed.values()] == [type(v) for v in options.values()]
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("bvh:arity=8", "method: need one of .*'rsh'.*, got 'bvh'"),
+    ("", "method: need one of"),
+    ("rsh:arity", "method 'rsh': need key=value, each key once, got 'arity'"),
+    ("rsh:=8", "got '=8'"),
+    ("rsh:", "got ''"),
+    ("rsh:arity=4:arity=8", "got 'arity=8'"),
+])  # fmt: skip
+def test_what_is_no_method_with_options(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_method(text, rs.methods())
 
 
 def test_samples_are_averaged_and_reported():

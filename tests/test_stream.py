@@ -195,6 +195,22 @@ def test_any_keys(keys, bits):
     np.testing.assert_array_equal(stream.sort_by_key(keys, bits=bits)[0], keys[order])
 
 
+@pytest.mark.parametrize("key", [np.uint32, np.uint64])
+@pytest.mark.parametrize("value", [None, np.uint32, np.uint64])
+def test_sort_of_a_length_on_the_device(key, value, session, rng):
+    for capacity in LENGTHS:
+        for length in {0, 1, capacity // 3, capacity} & set(range(capacity + 1)):
+            keys = rng.integers(0, 50, capacity, dtype=key)
+            values = None if value is None else np.arange(capacity, dtype=value)
+            order = np.argsort(keys[:length], kind="stable")
+            arrays = [None if a is None else session.upload("x", a) for a in (keys, values)]
+            on_device = session.upload("x", np.array([length], np.uint32))
+            sorted_keys, sorted_values = sort.sort_by_key(session, *arrays, 32, on_device)
+            np.testing.assert_array_equal(sorted_keys.get()[:length], keys[order])
+            if value is not None:
+                np.testing.assert_array_equal(sorted_values.get()[:length], values[order])
+
+
 # --- streams larger than the cache ---
 
 
@@ -216,6 +232,11 @@ def test_scan_past_the_cache(no_cache, rng):
 @pytest.mark.parametrize("value", [None, np.uint32, np.float64])
 def test_buffered_sort(no_cache, key, value, rng):
     test_sort_is_stable_and_ascending(key, value, rng)
+
+
+@pytest.mark.parametrize("value", [None, np.uint32, np.uint64])
+def test_buffered_sort_of_a_length_on_the_device(no_cache, value, session, rng):
+    test_sort_of_a_length_on_the_device(np.uint32, value, session, rng)
 
 
 @pytest.mark.parametrize("bits", [1, 11, 12, 23, 32])

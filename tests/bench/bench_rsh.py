@@ -33,19 +33,33 @@ SIZE = (512, 512)
 
 
 class _Recorder(rs.Tracer):
-    """Keeps the reflection rays of a frame."""
+    """Keeps the ray streams of a frame."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.bounces, self.shadows = [], []
 
     def intersect_stream(self, session, stream):
-        self.stream = stream
+        self.bounces.append(stream)
         return super().intersect_stream(session, stream)
 
+    def occluded_stream(self, session, stream):
+        self.shadows.append(stream)
+        return super().occluded_stream(session, stream)
 
-def reflection_rays(real, folder):
-    """The scene, and the first bounce of its mirror at 512 x 512, on the device."""
-    scene = real.load(folder)
+
+def frame_rays(scene, camera, size, max_bounces, shadows):
+    """The streams of a frame, on the device: those of its bounces and its shadow rays."""
     recorder = _Recorder(scene)
-    rs.Renderer(scene, recorder).render(real.camera, SIZE, max_bounces=1, shadows=False)
-    return scene, recorder.stream
+    rs.Renderer(scene, recorder).render(camera, size, max_bounces, shadows)
+    return recorder.bounces, recorder.shadows
+
+
+def reflection_rays(real, folder, size=SIZE):
+    """The scene, and the first bounce of its mirror, on the device."""
+    scene = real.load(folder)
+    bounces, _ = frame_rays(scene, real.camera, size, max_bounces=1, shadows=False)
+    return scene, bounces[0]
 
 
 @pytest.fixture(params=[BUNNY, PATIO], ids=lambda real: real.name)

@@ -1,0 +1,95 @@
+"""The order of rays in the leaves of a hierarchy: along the screen, or by their hashes."""
+
+import functools
+
+import numpy as np
+
+from raystream import compress, hash
+from raystream.statistics import RAY_CREATION
+
+_INVALID = np.uint32(0xFFFFFFFF)
+_TILE = 8
+
+
+def screen_slots(width, height):
+    """The rays of a screen in the order of the hierarchy's leaves.
+
+    Pixels follow the Z-order curve within tiles of 8 x 8, and the tiles that the screen has
+    follow it, too: every 4^k consecutive leaves of a tile are a square, 8 leaves are 4 x 2. Where
+    the side is a power of two this is the quad-tree of the paper; elsewhere only the tiles at the
+    right and lower edge carry null leaves.
+
+    Returns
+    -------
+    ndarray of shape (m,) uint32
+        Ray (pixel) of each leaf, 0xffffffff for a null leaf.
+    """
+    return _screen_slots(width, height).copy()
+
+
+@functools.lru_cache(maxsize=8)
+def _screen_slots(width, height):
+    columns, rows = -(-width // _TILE), -(-height // _TILE)
+    tile_y, tile_x = np.divmod(np.arange(columns * rows, dtype=np.uint64), np.uint64(columns))
+    order = np.argsort(_interleave(tile_x, tile_y), kind="stable")
+    within = np.arange(_TILE * _TILE, dtype=np.uint64)
+    x = tile_x[order, None] * _TILE + _deinterleave(within)
+    y = tile_y[order, None] * _TILE + _deinterleave(within >> np.uint64(1))
+    pixels = np.where((x < width) & (y < height), y * width + x, _INVALID)
+    return pixels.ravel().astype(np.uint32)
+
+
+def _interleave(x, y):
+    """Bits of x at the even places, bits of y at the odd places."""
+    return sum(
+        ((x >> np.uint64(b) & np.uint64(1)) << np.uint64(2 * b))
+        | ((y >> np.uint64(b) & np.uint64(1)) << np.uint64(2 * b + 1))
+        for b in range(24)
+    )
+
+
+def _deinterleave(code):
+    """The number made of the even bits of `code`."""
+    return sum((code >> np.uint64(2 * b) & np.uint64(1)) << np.uint64(b) for b in range(3))
+
+
+def leaf_slots(session, rays):
+    """The rays in the order in which they come, pixels in that of `screen_slots`.
+
+    Returns
+    -------
+    Array of shape (n,) uint32
+        Kept by the session: uploaded once per size.
+    """
+    key = rays.size if rays.size is not None else len(rays)
+    cache = session.cache.setdefault("leaf_slots", {})
+    if key not in cache:
+        host = (
+            np.arange(len(rays), dtype=np.uint32)
+            if rays.size is None
+            else _screen_slots(*rays.size)
+        )
+        cache.clear()  # one order at a time: sizes change rarely
+        cache[key] = session.upload(RAY_CREATION, host)
+    return cache[key]
+
+
+def hashed_slots(session, rays, slots, name):
+    """The active rays of `slots` sorted by their hashes (Reis et al. 2017, sections 3.3.2 to 5).
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    rays : raystream.rays.Rays
+    slots : Array of shape (n,) uint32
+        The order that rays of equal hashes keep.
+    name : str
+        One of `hash.HASHES`.
+
+    Returns
+    -------
+    Array of shape (n,) uint32
+        Behind the active rays 0xffffffff.
+    """
+    keys, active = hash.hash_rays(session, rays, slots, name)
+    return compress.coherent_slots(session, keys, slots, active, hash.BITS)[0]
