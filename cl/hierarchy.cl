@@ -3,6 +3,9 @@
 // Leaves are the rays (sphere radius and cone angle zero); every ARITY consecutive nodes have one
 // parent, the union of their cone-spheres. Layout of a node block: cl/node.h.
 //
+// Sixteen nodes are made at a time, one in each lane: lane l's child k is child k of parent first + l.
+// Lanes whose child is null, or that have no parent, compute along; unions mask them out.
+//
 // Unions: the sphere around the middle of the children's box; the cone around the middle of the box
 // of the children's axes, each grown by its sine, with the largest angle to any child's far side. Both
 // are tighter than merging the children two by two with the paper's theta/2 + max(phi) (the middle,
@@ -10,102 +13,171 @@
 // sin(theta + phi) is formed by addition, and an angle of pi/2 or more is all that is asked of wide
 // cones. Sines, not cosines, are compared: near zero a cosine does not tell angles apart.
 // Boxes: of the origins around the sphere's centre, and of the ends, or of the directions where a ray
-// has no end.
+// has no end. An end beyond FAR counts as none: differences of two ends must not overflow.
 // Rounding: sines are enlarged by SINE_SLACK, radii and extents by RADIUS_SLACK, ends by END_SLACK of
-// their coordinates, all well above the handful of roundings (u = 2^-24 each) that made them.
+// their coordinates, all well above the handful of roundings (u = 2^-24 each) that made them. Sums of
+// products may be fused, which takes roundings away; cross products not, so that they are exactly 0
+// of equal vectors.
 //
 // Build-time constants: ARITY; PAPER_BOUNDS for the unions of Reis et al. 2017 (cl/paper_bounds.h).
 
 #include "node.h"
 
 #define SINE_SLACK 0x1p-21f
-#define RADIUS_SLACK (1.0f + 0x1p-20f)
 #define REACH_SLACK (1.0f + 0x1p-21f)
 #define END_SLACK 0x1p-22f
+#define FAR 0x1p100f
+
+#define FLOAT4N (NODE_ROWS * ARITY / 4)
+#define UINTN CONCAT(uint, ARITY)
+
+// --- sixteen vectors -----------------------------------------------------------------------------
 
 typedef struct {
-    float4 centre, axis;
-    float radius, cosine, sine, reach;
-    float4 origin_half;            // of the origins' box around the centre
-    float4 end_middle, end_half;   // of the ends' box, where `finite` is 1, else of the directions'
-    float finite;
-} Node;
+    float16 x, y, z;
+} Vectors;
 
-inline void store_node(global float *blocks, ulong i, const Node n)
+inline Vectors all_axes(float16 v) { return (Vectors){v, v, v}; }
+
+inline Vectors plus(Vectors a, Vectors b) { return (Vectors){a.x + b.x, a.y + b.y, a.z + b.z}; }
+
+inline Vectors minus(Vectors a, Vectors b) { return (Vectors){a.x - b.x, a.y - b.y, a.z - b.z}; }
+
+inline Vectors times(Vectors a, float16 b) { return (Vectors){a.x * b, a.y * b, a.z * b}; }
+
+inline Vectors over(Vectors a, float16 b) { return (Vectors){a.x / b, a.y / b, a.z / b}; }
+
+inline Vectors magnitudes(Vectors a)
 {
-    global float *rows = blocks + (i / ARITY) * (NODE_ROWS * ARITY) + i % ARITY;
-    const float fields[NODE_ROWS] = {
-        n.centre.x,      n.centre.y,      n.centre.z,     n.radius,       n.axis.x,
-        n.axis.y,        n.axis.z,        n.cosine,       n.sine,         n.reach,
-        n.origin_half.x, n.origin_half.y, n.origin_half.z, n.end_middle.x, n.end_middle.y,
-        n.end_middle.z,  n.end_half.x,    n.end_half.y,   n.end_half.z,   n.finite};
+    return (Vectors){magnitude(a.x), magnitude(a.y), magnitude(a.z)};
+}
+
+inline float16 larger(float16 a, float16 b) { return a > b ? a : b; }
+
+inline Vectors larger_of_each(Vectors a, Vectors b)
+{
+    return (Vectors){larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)};
+}
+
+inline Vectors choose(int16 first, Vectors a, Vectors b)
+{
+    return (Vectors){first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z};
+}
+
+inline float16 dot_of(Vectors a, Vectors b) { return dot16(a.x, a.y, a.z, b.x, b.y, b.z); }
+
+inline float16 length_of(Vectors a) { return SQRT16(dot_of(a, a)); }
+
+inline Vectors cross_of(Vectors a, Vectors b)
+{
+    return (Vectors){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+// --- sixteen nodes -------------------------------------------------------------------------------
+
+// The fields are the rows of a block, in their order.
+typedef struct {
+    Vectors centre;
+    float16 radius;
+    Vectors axis;
+    float16 cosine, sine, reach;
+    Vectors origin_half;          // of the origins' box around the centre
+    Vectors end_middle, end_half; // of the ends' box, where `finite` is 1, else of the directions'
+    float16 finite;
+} Nodes;
+
+inline int16 is_live(const Nodes *n) { return n->reach >= 0.0f; }
+
+// Null nodes where not `live`, and no NaN of what was computed there.
+inline void keep(Nodes *n, int16 live)
+{
+    float16 *rows = (float16 *)n;
     for (uint row = 0; row < NODE_ROWS; row++)
-        rows[row * ARITY] = fields[row];
+        rows[row] = as_float16(as_int16(rows[row]) & live);
+    n->cosine = live ? n->cosine : 1.0f;
+    n->reach = live ? n->reach : NULL_REACH;
 }
 
-inline Node null_node(void)
+// The rays of slots first, first + step, .. as nodes; null where there is no slot, no ray in it, or an
+// inactive one (tfar < tnear).
+inline Nodes load_rays(ulong first, uint step, uint num_slots, global const uint *slots,
+                       global const float4 *org_tnear, global const float4 *dir_tfar)
 {
-    const Node n = {0.0f, 0.0f, 0.0f, 1.0f, 0.0f, NULL_REACH, 0.0f, 0.0f, 0.0f, 0.0f};
-    return n;
-}
+    float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));
+    for (uint lane = 0; lane < 16; lane++) {
+        const ulong slot = first + lane * step;
+        const uint ray = slot < num_slots ? slots[slot] : INVALID;
+        origins[lane] = org_tnear[ray == INVALID ? 0 : ray];
+        directions[lane] = dir_tfar[ray == INVALID ? 0 : ray];
+        directions[lane].w = ray == INVALID ? -INFINITY : directions[lane].w;
+    }
+    Vectors o, d;
+    float16 tnear, tfar;
+    TRANSPOSE16(origins, o.x, o.y, o.z, tnear);
+    TRANSPOSE16(directions, d.x, d.y, d.z, tfar);
 
-inline float largest(float4 v)
-{
-    const float4 m = fabs(v);
-    return MAX(m.x, MAX(m.y, m.z));
-}
-
-// The ray as a node; null where there is none or it is inactive (tfar < tnear).
-inline Node ray_node(uint ray, global const float4 *org_tnear, global const float4 *dir_tfar)
-{
-    Node n = null_node();
-    if (ray == INVALID)
-        return n;
-    const float4 o = org_tnear[ray], d = dir_tfar[ray];
-    if (!(d.w >= o.w))
-        return n;
     // Scaled by its largest component first: squares of tiny or huge ones leave the range.
-    const float scale = largest(d);
-    const float4 e = d / scale;
-    const float length = sqrt(dot3(e, e));
+    const Vectors m = magnitudes(d);
+    const float16 scale = larger(m.x, larger(m.y, m.z));
+    const Vectors e = over(d, scale);
+    const float16 length = length_of(e);
+    Nodes n;
     n.centre = o;
-    n.axis = e / length;
-    n.reach = d.w * scale * length * REACH_SLACK; // 0 * inf must not arise
-    const float4 step = d * d.w;
-    n.finite = largest(o + step) < INFINITY ? 1.0f : 0.0f;
-    n.end_middle = n.finite > 0.0f ? o + step : n.axis;
-    n.end_half = END_SLACK * (n.finite > 0.0f ? fabs(o) + fabs(step) : (float4)1.0f);
+    n.radius = 0.0f;
+    n.axis = over(e, length);
+    n.cosine = 1.0f;
+    n.sine = 0.0f;
+    n.reach = tfar * scale * length * REACH_SLACK; // 0 * inf must not arise
+    n.origin_half = all_axes(0.0f);
+    const Vectors way = times(d, tfar), sum = plus(magnitudes(o), magnitudes(way));
+    const int16 finite = (sum.x < FAR) & (sum.y < FAR) & (sum.z < FAR); // NaN of 0 * inf is not
+    n.end_middle = choose(finite, plus(o, way), n.axis);
+    n.end_half = times(choose(finite, sum, all_axes(1.0f)), END_SLACK);
+    n.finite = finite ? (float16)1.0f : (float16)0.0f;
+    keep(&n, tfar >= tnear);
     return n;
 }
 
-// Leaf `i` is ray `slots[i]`, or null where that is INVALID.
+// children[k]: child k of the sixteen parents from `first` on, null of those that have no block.
+inline void load_children(ulong first, uint num_blocks, global const float *blocks, Nodes *children)
+{
+    float16(*fields)[NODE_ROWS] = (float16(*)[NODE_ROWS])children;
+    global const float4 *block[16];
+    for (uint lane = 0; lane < 16; lane++)
+        block[lane] = (global const float4 *)blocks + MIN(first + lane, num_blocks - 1ul) * FLOAT4N;
+    for (uint k = 0; k < ARITY; k += 4)
+        for (uint row = 0; row < NODE_ROWS; row++) {
+            float4 siblings[16] __attribute__((aligned(64)));
+            for (uint lane = 0; lane < 16; lane++)
+                siblings[lane] = block[lane][(row * ARITY + k) / 4];
+            TRANSPOSE16(siblings, fields[k][row], fields[k + 1][row], fields[k + 2][row],
+                        fields[k + 3][row]);
+        }
+    const uint16 lanes = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    const int16 there = lanes < (uint16)MIN(num_blocks - first, 16ul);
+    for (uint k = 0; k < ARITY; k++)
+        children[k].reach = there ? children[k].reach : NULL_REACH;
+}
+
+// Nodes `first` .. first + 15, as far as there are so many, which are whole blocks.
+inline void store_nodes(global float *blocks, ulong first, uint num_nodes, Nodes n)
+{
+    const float *rows = (const float *)&n;
+    for (uint lane = 0; lane < 16 && first + lane < num_nodes; lane += ARITY) {
+        global FLOATN *block = (global FLOATN *)(blocks + (first + lane) * NODE_ROWS);
+        for (uint row = 0; row < NODE_ROWS; row++)
+            block[row] = *(const FLOATN *)(rows + row * 16 + lane);
+    }
+}
+
+// Leaf `i` is the ray of slot `i`. One work-item makes 16 leaves, padded to whole blocks.
 kernel void build_leaves(const uint num_leaves, const uint num_slots,
                          global const uint *restrict slots, global const float4 *restrict org_tnear,
                          global const float4 *restrict dir_tfar, global float *restrict blocks)
 {
     const ulong first = (ulong)get_global_id(0) * 16;
-    for (ulong i = first; i < first + 16 && i < num_leaves; i++)
-        store_node(blocks, i,
-                   ray_node(i < num_slots ? slots[i] : INVALID, org_tnear, dir_tfar));
-}
-
-inline Node load_child(global const float *block, uint lane)
-{
-    global const float *rows = block + lane;
-    float f[NODE_ROWS];
-    for (uint row = 0; row < NODE_ROWS; row++)
-        f[row] = rows[row * ARITY];
-    const Node n = {(float4)(f[0], f[1], f[2], 0.0f),
-                    (float4)(f[4], f[5], f[6], 0.0f),
-                    f[3],
-                    f[7],
-                    f[8],
-                    f[9],
-                    (float4)(f[10], f[11], f[12], 0.0f),
-                    (float4)(f[13], f[14], f[15], 0.0f),
-                    (float4)(f[16], f[17], f[18], 0.0f),
-                    f[19]};
-    return n;
+    store_nodes(blocks, first, num_leaves,
+                load_rays(first, 1, num_slots, slots, org_tnear, dir_tfar));
 }
 
 #ifdef PAPER_BOUNDS
@@ -114,121 +186,162 @@ inline Node load_child(global const float *block, uint lane)
 
 #else
 
-// Largest sine of an angle between `axis` and a ray of any child; 2 where that is pi/2 or more.
-inline float cone_sine(const Node *children, uint count, float4 axis)
+typedef struct {
+    Vectors low, high;
+} Boxes;
+
+inline Boxes empty_boxes(void)
 {
-    float widest = 0.0f;
-    for (uint k = 0; k < count; k++) {
-        const float4 perpendicular = cross3(axis, children[k].axis);
-        const float across = sqrt(dot3(perpendicular, perpendicular));
-        const float along = dot3(axis, children[k].axis);
-        const float sine = across * children[k].cosine + along * children[k].sine;
-        const float cosine = along * children[k].cosine - across * children[k].sine;
+    return (Boxes){all_axes(INFINITY), all_axes(-INFINITY)};
+}
+
+// Boxes where `live` take in the box of such extent around `middle`.
+inline void take_in(Boxes *b, int16 live, Vectors middle, Vectors extent)
+{
+    const Vectors low = minus(middle, extent), high = plus(middle, extent);
+    b->low.x = (live & (low.x < b->low.x)) ? low.x : b->low.x;
+    b->low.y = (live & (low.y < b->low.y)) ? low.y : b->low.y;
+    b->low.z = (live & (low.z < b->low.z)) ? low.z : b->low.z;
+    b->high.x = (live & (high.x > b->high.x)) ? high.x : b->high.x;
+    b->high.y = (live & (high.y > b->high.y)) ? high.y : b->high.y;
+    b->high.z = (live & (high.z > b->high.z)) ? high.z : b->high.z;
+}
+
+inline Vectors middle_of(Boxes b) { return plus(b.low, times(minus(b.high, b.low), 0.5f)); }
+
+inline void enclose_spheres(Nodes *n, const Nodes *children)
+{
+    Boxes box = empty_boxes();
+    for (uint k = 0; k < ARITY; k++)
+        take_in(&box, is_live(children + k), children[k].centre, all_axes(children[k].radius));
+    const Vectors centre = middle_of(box);
+    float16 radius = 0.0f;
+    for (uint k = 0; k < ARITY; k++) {
+        const float16 needed = length_of(minus(children[k].centre, centre)) + children[k].radius;
+        // NaN, where the box overflows, is taken and stays: then it is that of every child.
+        radius = (is_live(children + k) & ~(needed <= radius)) ? needed : radius;
+    }
+    radius *= RADIUS_SLACK;
+    const int16 bounded = radius < INFINITY; // else nothing is bounded, but nothing lost either
+    n->centre = choose(bounded, centre, all_axes(0.0f));
+    n->radius = bounded ? radius : INFINITY;
+}
+
+// Largest sine of an angle between `axis` and a ray of any child; 2 where that is pi/2 or more.
+inline float16 cone_sine(Vectors axis, const Nodes *children)
+{
+    float16 widest = 0.0f;
+    for (uint k = 0; k < ARITY; k++) {
+        const Nodes *c = children + k;
+        const float16 across = length_of(cross_of(axis, c->axis)), along = dot_of(axis, c->axis);
+        const float16 sine = FMA16(across, c->cosine, along * c->sine);
+        const float16 cosine = FMA16(along, c->cosine, -(across * c->sine));
         // The cosine must be positive beyond its own rounding.
-        const float sine_or_wide = children[k].cosine > 0.0f && cosine > SINE_SLACK ? sine : 2.0f;
-        widest = MAX(widest, sine_or_wide);
+        const int16 narrow = (c->cosine > 0.0f) & (cosine > SINE_SLACK);
+        const float16 sine_or_wide = narrow ? sine : 2.0f;
+        widest = (is_live(c) & (sine_or_wide > widest)) ? sine_or_wide : widest;
     }
     return widest;
 }
 
-// Boxes of the origins, and of the ends or the directions.
-inline void enclose_boxes(Node *n, const Node *children, uint count)
+inline void enclose_cones(Nodes *n, const Nodes *children)
 {
-    float4 low = INFINITY, high = -INFINITY;
-    n->finite = 1.0f;
-    for (uint k = 0; k < count; k++)
-        n->finite = MIN(n->finite, children[k].finite);
-    for (uint k = 0; k < count; k++) {
-        const Node *c = children + k;
-        const float4 origin = fabs(c->centre - n->centre) + c->origin_half;
-        n->origin_half = origin > n->origin_half ? origin : n->origin_half;
-        float4 middle = c->end_middle, extent = c->end_half + END_SLACK * fabs(c->end_middle);
-        if (n->finite < c->finite) { // ends among directions: what the cone says of these
-            middle = c->cosine > 0.0f ? c->axis : (float4)0.0f;
-            extent = c->cosine > 0.0f ? c->sine + SINE_SLACK : 1.0f;
-        }
-        low = middle - extent < low ? middle - extent : low;
-        high = middle + extent > high ? middle + extent : high;
-    }
-    n->origin_half *= RADIUS_SLACK;
-    n->end_middle = low + 0.5f * (high - low);
-    const float4 up = high - n->end_middle, down = n->end_middle - low;
-    n->end_half = (up > down ? up : down) * RADIUS_SLACK;
+    Boxes box = empty_boxes();
+    for (uint k = 0; k < ARITY; k++)
+        take_in(&box, is_live(children + k), children[k].axis, all_axes(children[k].sine));
+    const Vectors sum = plus(box.low, box.high);
+    const float16 length = length_of(sum);
+    const Vectors axis = over(sum, length);
+    float16 sine = cone_sine(axis, children);
+    sine = sine > 0.0f ? sine + SINE_SLACK : sine;
+    // Opposite axes cancel: any direction then. NaN compares false, too.
+    const int16 narrow = (length > 0x1p-10f) & (sine < 1.0f);
+    const Vectors any = {1.0f, 0.0f, 0.0f};
+    n->axis = choose(narrow, axis, any);
+    n->sine = narrow ? sine : 1.0f;
+    n->cosine = narrow ? SQRT16((1.0f - sine) * (1.0f + sine)) : 0.0f;
 }
 
-inline Node enclose(const Node *children, uint count)
+// Boxes of the origins, and of the ends or the directions.
+inline void enclose_boxes(Nodes *n, const Nodes *children)
 {
-    Node n = null_node();
-    if (count == 0)
-        return n;
-    float4 low = INFINITY, high = -INFINITY, first = INFINITY, last = -INFINITY;
-    for (uint k = 0; k < count; k++) {
-        const float4 l = children[k].centre - children[k].radius;
-        const float4 h = children[k].centre + children[k].radius;
-        low = l < low ? l : low;
-        high = h > high ? h : high;
-        const float4 before = children[k].axis - children[k].sine;
-        const float4 after = children[k].axis + children[k].sine;
-        first = before < first ? before : first;
-        last = after > last ? after : last;
-        n.reach = MAX(n.reach, children[k].reach);
+    n->finite = 1.0f;
+    for (uint k = 0; k < ARITY; k++)
+        n->finite = (is_live(children + k) & (children[k].finite == 0.0f)) ? 0.0f : n->finite;
+    n->origin_half = all_axes(0.0f);
+    Boxes ends = empty_boxes();
+    for (uint k = 0; k < ARITY; k++) {
+        const Nodes *c = children + k;
+        const int16 live = is_live(c);
+        const Vectors origin = plus(magnitudes(minus(c->centre, n->centre)), c->origin_half);
+        n->origin_half
+            = choose(live, larger_of_each(origin, n->origin_half), n->origin_half);
+        // Ends among directions: what the cone says of these, 2 sin(alpha/2) at most from its axis.
+        const int16 mixed = n->finite < c->finite, narrow = c->cosine > 0.0f;
+        const float16 chord = c->sine / SQRT16(0.5f + 0.5f * c->cosine) + SINE_SLACK;
+        const float16 spread = narrow ? chord : 1.0f;
+        const Vectors direction = choose(narrow, c->axis, all_axes(0.0f));
+        const Vectors extent = plus(c->end_half, times(magnitudes(c->end_middle), END_SLACK));
+        take_in(&ends, live, choose(mixed, direction, c->end_middle),
+                choose(mixed, all_axes(spread), extent));
     }
-    n.centre = low + 0.5f * (high - low);
-    for (uint k = 0; k < count; k++) {
-        const float4 offset = children[k].centre - n.centre;
-        const float radius = sqrt(dot3(offset, offset)) + children[k].radius;
-        n.radius = MAX(n.radius, radius);
-    }
-    n.radius *= RADIUS_SLACK;
-    if (!(n.radius < INFINITY)) { // origins so far apart bound nothing, but lose nothing either
-        n.centre = 0.0f;
-        n.radius = INFINITY;
-    }
-    enclose_boxes(&n, children, count);
-    const float4 sum = first + last;
-    const float length = sqrt(dot3(sum, sum));
-    n.axis = sum / length;
-    // Opposite axes cancel: any direction then. NaN compares false, too.
-    float sine = length > 0x1p-10f ? cone_sine(children, count, n.axis) : 2.0f;
-    if (sine > 0.0f)
-        sine += SINE_SLACK;
-    if (sine < 1.0f) {
-        n.sine = sine;
-        n.cosine = sqrt((1.0f - sine) * (1.0f + sine));
-    } else {
-        n.axis = (float4)(1.0f, 0.0f, 0.0f, 0.0f);
-        n.sine = 1.0f;
-        n.cosine = 0.0f;
-    }
+    n->origin_half = times(n->origin_half, RADIUS_SLACK);
+    n->end_middle = middle_of(ends);
+    n->end_half = times(larger_of_each(minus(ends.high, n->end_middle),
+                                       minus(n->end_middle, ends.low)),
+                        RADIUS_SLACK);
+}
+
+// The parents, where any child is not null.
+inline Nodes enclose(const Nodes *children)
+{
+    Nodes n;
+    n.reach = NULL_REACH;
+    for (uint k = 0; k < ARITY; k++)
+        n.reach = larger(n.reach, children[k].reach);
+    enclose_spheres(&n, children);
+    enclose_cones(&n, children);
+    enclose_boxes(&n, children);
     return n;
 }
 
 #endif
 
-// One work-item makes 16 parents, padded to whole blocks. `valid[b]` counts the children of parent b
-// that are not null.
-#define DEFINE_BUILD(NAME, CHILD, ...)                                                             \
-    kernel void NAME(const uint num_children, const uint num_parents, __VA_ARGS__,                 \
-                     global float *restrict parent_blocks, global uint *restrict valid)            \
-    {                                                                                              \
-        const ulong first = (ulong)get_global_id(0) * 16;                                          \
-        for (ulong i = first; i < first + 16 && i < num_parents; i++) {                            \
-            Node children[ARITY];                                                                  \
-            uint count = 0;                                                                        \
-            for (uint lane = 0; lane < ARITY && i * ARITY + lane < num_children; lane++) {         \
-                const Node child = CHILD;                                                          \
-                if (child.reach >= 0.0f)                                                           \
-                    children[count++] = child;                                                     \
-            }                                                                                      \
-            valid[i] = count;                                                                      \
-            store_node(parent_blocks, i, enclose(children, count));                                \
-        }                                                                                          \
-    }
+// Stores the sixteen parents from `first` on; valid[i] counts the children of i that are not null.
+inline void build(ulong first, uint num_parents, const Nodes *children, global float *parent_blocks,
+                  global uint *valid)
+{
+    int16 count = 0;
+    for (uint k = 0; k < ARITY; k++)
+        count -= is_live(children + k);
+    Nodes parents = enclose(children);
+    keep(&parents, count > 0);
+    store_nodes(parent_blocks, first, num_parents, parents);
+    for (uint lane = 0; lane < 16 && first + lane < num_parents; lane += ARITY)
+        *(global UINTN *)(valid + first + lane) = *(UINTN *)((uint *)&count + lane);
+}
 
-DEFINE_BUILD(build_parents, load_child(child_blocks + i * (NODE_ROWS * ARITY), lane),
-             global const float *restrict child_blocks)
+// One work-item makes 16 parents, padded to whole blocks.
+kernel void build_parents(const uint num_children, const uint num_parents,
+                          global const float *restrict child_blocks,
+                          global float *restrict parent_blocks, global uint *restrict valid)
+{
+    const ulong first = (ulong)get_global_id(0) * 16;
+    Nodes children[ARITY];
+    load_children(first, (num_children + ARITY - 1) / ARITY, child_blocks, children);
+    build(first, num_parents, children, parent_blocks, valid);
+}
 
-// Level 1 without its leaves: where no leaf is ever tested none is stored.
-DEFINE_BUILD(build_parents_of_rays, ray_node(slots[i * ARITY + lane], org_tnear, dir_tfar),
-             global const uint *restrict slots, global const float4 *restrict org_tnear,
-             global const float4 *restrict dir_tfar)
+// Level 1 from the rays themselves: they are less to read than their leaves, which may not be stored.
+kernel void build_parents_of_rays(const uint num_slots, const uint num_parents,
+                                  global const uint *restrict slots,
+                                  global const float4 *restrict org_tnear,
+                                  global const float4 *restrict dir_tfar,
+                                  global float *restrict parent_blocks, global uint *restrict valid)
+{
+    const ulong first = (ulong)get_global_id(0) * 16;
+    Nodes children[ARITY];
+    for (uint k = 0; k < ARITY; k++)
+        children[k] = load_rays(first * ARITY + k, ARITY, num_slots, slots, org_tnear, dir_tfar);
+    build(first, num_parents, children, parent_blocks, valid);
+}

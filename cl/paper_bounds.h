@@ -3,84 +3,88 @@
 // Looser than those of hierarchy.cl; kept so that the paper's counts can be reproduced. Rays join a
 // cone by Szecsi's rule (equations 1 to 4; the signs, garbled in print, follow from the drawing), cones
 // by half their axes' angle plus the larger half-angle (5, 6: the printed left side must be the angle,
-// not its cosine), spheres by the middle of their centres (7, 8). Nodes know no tfar.
+// not its cosine), spheres by the middle of their centres (7, 8). Nodes know no tfar, and no boxes.
 //
-// Every step is rounded outwards by the slacks of hierarchy.cl.
+// Every step is rounded outwards by the slacks of hierarchy.cl, and changes the lanes that join alone.
 
-// The cone whose rays lie within `sine` of `axis`; any direction where that is pi/2 or more.
-inline void set_cone(Node *n, float4 axis, float sine, bool wide)
+// The cones whose rays lie within `sine` of `axis`; any direction where that is pi/2 or more.
+inline void set_cones(Nodes *n, int16 joins, Vectors axis, float16 sine, int16 wide)
 {
     sine += SINE_SLACK;
-    wide = wide || !(sine < 1.0f);
-    n->axis = wide ? (float4)(1.0f, 0.0f, 0.0f, 0.0f) : axis;
-    n->sine = wide ? 1.0f : sine;
-    n->cosine = wide ? 0.0f : sqrt((1.0f - sine) * (1.0f + sine));
+    const int16 narrow = ~wide & (sine < 1.0f);
+    const Vectors any = {1.0f, 0.0f, 0.0f};
+    n->axis = choose(joins, choose(narrow, axis, any), n->axis);
+    const float16 cosine = narrow ? SQRT16((1.0f - sine) * (1.0f + sine)) : 0.0f;
+    n->cosine = joins ? cosine : n->cosine;
+    sine = narrow ? sine : 1.0f;
+    n->sine = joins ? sine : n->sine;
 }
 
-inline float sine_between(float4 a, float4 b)
-{
-    const float4 across = cross3(a, b);
-    return sqrt(dot3(across, across));
-}
+inline float16 sine_between(Vectors a, Vectors b) { return length_of(cross_of(a, b)); }
 
 // Equations 1 to 4: the far edge e of the cone, seen from the ray r, and r become the new edges.
-inline void add_ray(Node *n, float4 r)
+inline void add_rays(Nodes *n, int16 joins, Vectors r)
 {
-    const float along = dot3(n->axis, r), across = sine_between(n->axis, r);
-    if (along > 0.0f && across <= n->sine)
-        return;
-    float4 e = n->axis;
-    if (n->sine > 0.0f && across > 0.0f) // a ray opposite to the axis has no plane with it: wide below
-        e = n->axis * n->cosine + (along * n->axis - r) / across * n->sine;
-    const float4 sum = e + r;
-    const float length = sqrt(dot3(sum, sum));
-    const float4 axis = sum / length;
-    const bool turned = across * n->cosine + along * n->sine <= 0.0f; // theta + phi >= pi
-    const float edge = sine_between(axis, e), ray = sine_between(axis, r);
-    set_cone(n, axis, MAX(edge, ray),
-             turned || !(length > 0x1p-10f) || dot3(axis, r) <= SINE_SLACK);
+    const float16 along = dot_of(n->axis, r), across = sine_between(n->axis, r);
+    const int16 inside = (along > 0.0f) & (across <= n->sine);
+    const Vectors away = over(minus(times(n->axis, along), r), across);
+    const Vectors edge = plus(times(n->axis, n->cosine), times(away, n->sine));
+    // A ray opposite to the axis has no plane with it: wide below.
+    const Vectors e = choose((n->sine > 0.0f) & (across > 0.0f), edge, n->axis);
+    const Vectors sum = plus(e, r);
+    const float16 length = length_of(sum);
+    const Vectors axis = over(sum, length);
+    const int16 turned = across * n->cosine + along * n->sine <= 0.0f; // theta + phi >= pi
+    set_cones(n, joins & ~inside, axis, larger(sine_between(axis, e), sine_between(axis, r)),
+              turned | ~(length > 0x1p-10f) | (dot_of(axis, r) <= SINE_SLACK));
 }
 
 // Equations 5 and 6.
-inline void add_cone(Node *n, const Node *other)
+inline void add_cones(Nodes *n, int16 joins, const Nodes *other)
 {
-    const float4 sum = n->axis + other->axis;
-    const float length = sqrt(dot3(sum, sum));
-    const float4 axis = sum / length;
-    const bool first = n->sine >= other->sine;
-    const float sine = first ? n->sine : other->sine, cosine = first ? n->cosine : other->cosine;
-    const float half_across = MAX(sine_between(axis, n->axis), sine_between(axis, other->axis));
-    const float half_along = dot3(axis, n->axis);
-    const bool wide = n->cosine <= 0.0f || other->cosine <= 0.0f || !(length > 0x1p-10f)
-                      || half_along * cosine - half_across * sine <= SINE_SLACK;
-    set_cone(n, axis, half_across * cosine + half_along * sine, wide);
+    const Vectors sum = plus(n->axis, other->axis);
+    const float16 length = length_of(sum);
+    const Vectors axis = over(sum, length);
+    const int16 first = n->sine >= other->sine;
+    const float16 sine = first ? n->sine : other->sine, cosine = first ? n->cosine : other->cosine;
+    const float16 half_across
+        = larger(sine_between(axis, n->axis), sine_between(axis, other->axis));
+    const float16 half_along = dot_of(axis, n->axis);
+    const int16 wide = (other->cosine <= 0.0f) | ~(length > 0x1p-10f)
+                       | (half_along * cosine - half_across * sine <= SINE_SLACK);
+    set_cones(n, joins, axis, half_across * cosine + half_along * sine, wide);
 }
 
 // Equations 7 and 8.
-inline void add_sphere(Node *n, const Node *other)
+inline void add_spheres(Nodes *n, int16 joins, const Nodes *other)
 {
-    const float4 offset = other->centre - n->centre;
-    const float apart = 0.5f * sqrt(dot3(offset, offset));
-    const float radius = (apart + MAX(n->radius, other->radius)) * RADIUS_SLACK;
-    const bool bounded = radius < INFINITY; // as in hierarchy.cl
-    n->centre = bounded ? n->centre + 0.5f * offset : (float4)0.0f;
-    n->radius = bounded ? radius : INFINITY;
+    const Vectors step = times(minus(other->centre, n->centre), 0.5f);
+    const float16 radius = (length_of(step) + larger(n->radius, other->radius)) * RADIUS_SLACK;
+    const int16 bounded = radius < INFINITY; // as in hierarchy.cl
+    const Vectors centre = choose(bounded, plus(n->centre, step), all_axes(0.0f));
+    n->centre = choose(joins, centre, n->centre);
+    const float16 radius_or_any = bounded ? radius : INFINITY;
+    n->radius = joins ? radius_or_any : n->radius;
 }
 
-inline Node enclose(const Node *children, uint count)
+// The parents, where any child is not null.
+inline Nodes enclose(const Nodes *children)
 {
-    if (count == 0)
-        return null_node();
-    Node n = children[0];
-    n.reach = INFINITY;
-    for (uint k = 1; k < count; k++) {
-        add_sphere(&n, children + k);
-        if (n.cosine <= 0.0f)
-            continue; // any direction already
-        if (children[k].sine == 0.0f)
-            add_ray(&n, children[k].axis);
-        else
-            add_cone(&n, children + k);
+    Nodes n = children[0];
+    for (uint k = 1; k < ARITY; k++) {
+        const Nodes *c = children + k;
+        const int16 first = is_live(c) & ~is_live(&n), joins = is_live(c) & ~first;
+        add_spheres(&n, joins, c);
+        const int16 narrow = joins & (n.cosine > 0.0f); // else any direction already
+        add_rays(&n, narrow & (c->sine == 0.0f), c->axis);
+        add_cones(&n, narrow & (c->sine > 0.0f), c);
+        n.centre = choose(first, c->centre, n.centre);
+        n.radius = first ? c->radius : n.radius;
+        n.axis = choose(first, c->axis, n.axis);
+        n.cosine = first ? c->cosine : n.cosine;
+        n.sine = first ? c->sine : n.sine;
+        n.reach = first ? c->reach : n.reach;
     }
+    n.reach = INFINITY;
     return n;
 }

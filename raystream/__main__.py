@@ -10,7 +10,7 @@ import pyopencl as cl
 from tqdm import tqdm
 
 from raystream import image as images
-from raystream import scenes
+from raystream import scenes, tables
 from raystream._version import __version__
 from raystream.camera import Camera
 from raystream.device import default_device, devices
@@ -260,7 +260,7 @@ def _compare(options):
     scene = _scene(options)
     results, reference = _results(chosen, options, scene, _camera(options, scene))
     if options.counts:
-        print("\n".join(["", *compare.count_tables(results)]))
+        print("\n".join(["", *tables.count_tables(results)]))
     if options.output is not None:
         _save_pictures(pathlib.Path(options.output), results, reference)
     return _failed(results)
@@ -280,7 +280,7 @@ def _results(chosen, options, scene, camera):
         results, reference = compare.compare(
             scene, chosen, camera, options.size, options.bounces, progress
         )
-    print("\n".join(compare.table(results)))
+    print("\n".join(tables.table(results)))
     return results, reference
 
 

@@ -4,9 +4,10 @@ The ray-space hierarchy (`rsh`) over rays that are hashed and sorted first, so t
 that go the same way from the same place; and whole parts of the scene are culled by their bounding
 spheres before their triangles are tested against the top level.
 
-The paper's algorithm: ``hash="paper", bound="paper", clusters=None, arity=8, levels=2``. Beyond it,
-and the default: hashes that keep neighbours together, tighter nodes that know their rays' tfar, and
-clusters of neighbouring triangles, made anew every frame, in the place of whole meshes.
+The paper's algorithm: ``hash="paper", bound="paper", arity=8, levels=2``. Beyond it, and the
+default: hashes that keep neighbours together, tighter nodes that know where their rays end, and
+clusters of neighbouring triangles, made anew every frame, in the place of whole meshes. Defaults:
+those of the fewest tests over the scenes of tests/bench/bench_counts.py.
 """
 
 from raystream.checks import check_choice, check_count
@@ -16,6 +17,7 @@ from raystream.order import hashed_slots
 from raystream.pairs import FUSED
 from raystream.rsh import RayspaceTracer
 
+_CLUSTER_SIZE = 32
 _CLUSTER_STEP = 16  # clusters are whole blocks of spheres: cl/objects.cl
 
 
@@ -36,9 +38,9 @@ class CoherentTracer(RayspaceTracer):
         How nodes are united (cl/hierarchy.cl, cl/paper_bounds.h).
     cull_meshes : bool
         Test the top level's nodes against bounding spheres of parts of the scene first.
-    clusters : int or None
-        These parts: clusters of so many triangles, a multiple of 16, or None, whole meshes, as in
-        the paper.
+    clusters : int, None or "auto"
+        These parts: clusters of so many triangles, a multiple of 16, or whole meshes where None, as
+        in the paper. "auto": None with the bounds of the paper, else 32.
 
     Raises
     ------
@@ -57,12 +59,14 @@ class CoherentTracer(RayspaceTracer):
         hash=DEFAULT_HASH,
         bound="tight",
         cull_meshes=True,
-        clusters=32,
+        clusters="auto",
     ):
         check_count("levels", levels)
         super().__init__(session, geometry, memory_limit, arity, levels, reduction, bound)
         check_choice("hash", hash, (*HASHES, None))
         check_choice("cull_meshes", cull_meshes, (True, False))
+        if clusters == "auto":
+            clusters = None if bound == "paper" else _CLUSTER_SIZE
         if clusters is not None and check_count("clusters", clusters) % _CLUSTER_STEP != 0:
             raise ValueError(f"clusters: need a multiple of {_CLUSTER_STEP}, got {clusters}")
         self._hash, self._culling = hash, None

@@ -52,9 +52,7 @@ class RayHierarchy:
         if leaves:
             self.blocks[0] = self._empty_blocks(count)
             self._build_leaves(rays)
-            self._build_level(1, "build_parents", self.blocks[0])
-        else:
-            self._build_level(1, "build_parents_of_rays", slots, rays.org_tnear, rays.dir_tfar)
+        self._build_level(1, "build_parents_of_rays", slots, rays.org_tnear, rays.dir_tfar)
         for level in range(2, self.num_levels + 1):
             self._build_level(level, "build_parents", self.blocks[level - 1])
 

@@ -27,7 +27,7 @@ class Statistics:
         Top level first: ``nodes`` (without null nodes), ``tests`` (node, triangle), ``hits`` and
         ``misses`` of these tests.
     mesh_tests : int
-        Tests of nodes against whole-mesh bounding spheres.
+        Tests of top-level nodes against the bounding spheres of meshes or clusters (`crsh`).
     final_tests, final_hits : int
         Ray-triangle tests and how many of them hit within the ray's segment.
     rays, triangles : int

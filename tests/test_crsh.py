@@ -10,7 +10,7 @@ import raystream as rs
 from raystream import device, hash, rays, scenes
 from raystream.statistics import COMPRESSION, DECOMPRESSION, RAY_CREATION, SORTING
 
-PAPER = {"hash": "paper", "bound": "paper", "clusters": None, "arity": 8, "levels": 2}
+PAPER = {"hash": "paper", "bound": "paper", "arity": 8, "levels": 2}
 FIELDS = ("t", "prim_id", "geom_id", "u", "v")
 OPTIONS = [
     {}, PAPER, {"hash": None}, {"clusters": None}, {"cull_meshes": False}, {"clusters": 16},

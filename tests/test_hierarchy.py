@@ -19,7 +19,7 @@ def stream(origins, directions, tfar=np.inf):
 
 
 def assert_bounds(hierarchy, origins, directions, tfar):
-    """Every node's cone-sphere, in float64, holds its active rays."""
+    """Every node's cone-sphere, and its boxes, in float64, hold its active rays."""
     length = np.linalg.norm(directions.astype(np.float64), axis=1)
     unit = directions / length[:, None]
     active = tfar >= 0
@@ -30,6 +30,7 @@ def assert_bounds(hierarchy, origins, directions, tfar):
     assert np.isin(np.flatnonzero(active), slots).all()
     for k in range(hierarchy.num_levels + 1):
         nodes = hierarchy.nodes(k).astype(np.float64)
+        assert not np.isnan(nodes).any()
         of_ray = slot_of_ray // hierarchy.arity**k
         centre, radius, axis, cosine, sine, reach = np.split(
             nodes[of_ray], [3, 4, 7, 8, 9], axis=1
@@ -41,10 +42,33 @@ def assert_bounds(hierarchy, origins, directions, tfar):
         # 2 u: the axis of a single ray is its direction, rounded (cl/node.h covers that).
         inside = (cosine[:, 0] <= 0) | ((along > 0) & (across <= sine[:, 0] + 2**-22))
         assert inside[active].all()
-        assert (tfar * length <= reach[:, 0])[active].all()
+        # A tiny reach is rounded to whole multiples of 2^-149.
+        assert (tfar * length <= reach[:, 0] + 2**-140)[active].all()
         holds_ray = np.zeros(len(nodes), bool)
         holds_ray[of_ray[active]] = True
         np.testing.assert_array_equal(nodes[:, 9] >= 0, holds_ray)
+        if hierarchy.bound == "tight":
+            assert_boxes(nodes, of_ray[active], origins[active], directions[active], tfar[active])
+
+
+def assert_boxes(nodes, of_ray, origins, directions, tfar):
+    """Node `of_ray[i]` holds the origin of ray i, and its end or, where a ray has none, its way."""
+    origins, directions = origins.astype(np.float64), directions.astype(np.float64)
+    unit = directions / np.linalg.norm(directions, axis=1)[:, None]
+    with np.errstate(invalid="ignore"):  # 0 * inf
+        ways = tfar[:, None].astype(np.float64) * directions
+        has_end = (np.abs(origins) + np.abs(ways) < 2.0**100).all(axis=1)
+    all_end = np.ones(len(nodes), bool)
+    all_end[of_ray[~has_end]] = False
+    live = nodes[:, 9] >= 0
+    np.testing.assert_array_equal(nodes[live, 19], all_end[live])
+    centre, origin_half, middle, half = (nodes[of_ray, i : i + 3] for i in (0, 10, 13, 16))
+    assert (np.abs(origins - centre) <= origin_half).all()
+    at_end = all_end[of_ray]
+    ends = (origins + ways)[at_end]
+    assert (np.abs(ends - middle[at_end]) <= half[at_end]).all()
+    turned = ~at_end
+    assert (np.abs(unit - middle)[turned] <= half[turned] + 2**-22).all()
 
 
 @pytest.mark.parametrize("order", ["screen", "hash"])
@@ -53,7 +77,8 @@ def assert_bounds(hierarchy, origins, directions, tfar):
 @pytest.mark.parametrize("count", COUNTS)
 def test_nodes_bound_their_rays(rng, order, bound, arity, count):
     origins, directions = random_rays(rng, count)
-    tfar = np.where(rng.random(count) < 0.3, -1.0, rng.random(count) * 3).astype(np.float32)
+    tfar = rng.choice([-1.0, 1.0, np.inf], count, p=[0.3, 0.65, 0.05]) * 3 * rng.random(count)
+    tfar = tfar.astype(np.float32)
     rays_given = stream(origins, directions, tfar)
     hierarchy = rs.RayHierarchy.build(rays_given, arity, order=order, bound=bound)
     assert hierarchy.num_nodes[-1] == 1
@@ -68,17 +93,44 @@ def test_nodes_bound_their_rays(rng, order, bound, arity, count):
     st.floats(0, 4),
     st.floats(0, 4),
     st.sampled_from([1e-4, 1.0, 1e5]),
+    st.sampled_from([0.0, 0.05, 1.0]),
     st.sampled_from(BOUNDS),
 )
-def test_nodes_bound_bundles_of_any_spread(seed, angular, spatial, scale, bound):
+def test_nodes_bound_bundles_of_any_spread(seed, angular, spatial, scale, endless, bound):
     rng = np.random.default_rng(seed)
     base = rng.normal(size=3)
     directions = base / np.linalg.norm(base) + angular * rng.normal(size=(64, 3))
     origins = scale * (rng.normal(size=3) + spatial * rng.normal(size=(64, 3)))
     origins, directions = origins.astype(np.float32), directions.astype(np.float32)
-    tfar = np.full(64, np.inf, np.float32)
-    hierarchy = rs.RayHierarchy.build(stream(origins, directions), bound=bound)
+    tfar = np.where(rng.random(64) < endless, np.inf, scale * rng.random(64)).astype(np.float32)
+    hierarchy = rs.RayHierarchy.build(stream(origins, directions, tfar), bound=bound)
     assert_bounds(hierarchy, origins, directions, tfar)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0, 18, 19, 37, 38]),
+    st.sampled_from([-45, -38, 0, 37]),
+    st.sampled_from([-45, 0, 30, 38]),
+    st.sampled_from([4, 8]),
+    st.sampled_from(BOUNDS),
+)
+def test_nodes_bound_rays_at_the_ends_of_the_range(seed, origin, direction, far, arity, bound):
+    """Powers of ten that are reached by one ray in two; denormal ones, and those that overflow."""
+    rng = np.random.default_rng(seed)
+
+    def powers(exponent):
+        return 10.0 ** np.where(rng.random((300, 1)) < 0.5, exponent, rng.integers(-2, 2, (300, 1)))
+
+    origins = rng.uniform(-3, 3, (300, 3)) * powers(origin)
+    directions = rng.choice([-1, 0, 1], (300, 3), p=[0.2, 0.3, 0.5]) * rng.uniform(2, 9, (300, 1))
+    directions[~directions.any(axis=1), 2] = 1
+    directions = directions * powers(direction)
+    tfar = rng.choice([-1, 0, 1], 300, p=[0.2, 0.1, 0.7]) * 3 * powers(far)[:, 0]
+    tfar[rng.random(300) < 0.02] = np.inf
+    data = [a.astype(np.float32) for a in (origins, directions, tfar)]
+    assert_bounds(rs.RayHierarchy.build(stream(*data), arity, bound=bound), *data)
 
 
 @pytest.mark.parametrize("bound", BOUNDS)

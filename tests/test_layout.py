@@ -29,7 +29,7 @@ TIERS = (
     {"crsh"},
     {"tracer", "host_tracer"},
     {"renderer"},
-    {"compare", "__init__"},
+    {"compare", "tables", "__init__"},
     {"__main__"},
 )
 

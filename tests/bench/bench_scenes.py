@@ -15,7 +15,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent.parent))
 from real_scenes import REAL_SCENES
 from tqdm import tqdm
 
-from raystream import compare
+from raystream import compare, tables
 from raystream import image as images
 
 
@@ -37,7 +37,7 @@ def main():
         names = options.methods.split(",")
         results, reference = compare.compare(scene, names, real.camera, size)
         print(f"\n{real.name}: {scene.num_triangles} triangles")
-        print("\n".join(compare.table(results)), flush=True)
+        print("\n".join(tables.table(results)), flush=True)
         failed += [f"{real.name}/{r.method}" for r in results if not r.ok]
         if options.output:
             options.output.mkdir(parents=True, exist_ok=True)
