@@ -24,6 +24,17 @@ inline float4 cross3(float4 a, float4 b)
     return (float4)(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x, 0.0f);
 }
 
+inline float16 magnitude(float16 x) { return as_float16(as_int16(x) & 0x7fffffff); }
+
+inline float16 larger(float16 a, float16 b) { return a > b ? a : b; }
+
+inline float lowest(float16 v)
+{
+    const float8 a = v.lo < v.hi ? v.lo : v.hi;
+    const float4 b = a.lo < a.hi ? a.lo : a.hi;
+    return MIN(MIN(b.x, b.y), MIN(b.z, b.w));
+}
+
 #ifdef CHUNKS
 // First element of a chunk, where CHUNKS of them share a stream of n elements.
 inline ulong chunk_first(ulong chunk, ulong n) { return chunk * n / CHUNKS; }

@@ -17,45 +17,14 @@
 // Build-time constants: CHUNKS, CELL_BITS (of a coordinate of the origin); HASH_PAPER,
 // ANGLE_BITS, SHADOW_ANGLE_BITS, or COARSE_BITS, FINE_BITS, WIDE_BITS, END_BITS.
 
-#include "common.h"
 #include "hilbert.h"
-
-typedef struct {
-    float16 ox, oy, oz, dx, dy, dz, tfar;
-    int16 active; // of a slot that holds a ray that is traced
-} Rays16;
+#include "rays.h"
 
 // What a key divides: grid[0] origins, grid[1] ends.
 typedef struct {
     float4 low;
     float4 extent; // infinite or NaN where a ray has no end
 } Box;
-
-// The rays of `count` slots, at most 16, from `first` on.
-inline Rays16 load_rays(ulong first, uint count, global const uint *slots,
-                        global const float4 *org_tnear, global const float4 *dir_tfar)
-{
-    float4 o[16] __attribute__((aligned(64))), d[16] __attribute__((aligned(64)));
-    for (uint k = 0; k < 16; k++) {
-        const uint ray = k < count ? slots[first + k] : INVALID;
-        o[k] = org_tnear[ray == INVALID ? 0 : ray];
-        d[k] = dir_tfar[ray == INVALID ? 0 : ray];
-        d[k].w = ray == INVALID ? -INFINITY : d[k].w;
-    }
-    Rays16 r;
-    float16 tnear;
-    TRANSPOSE16(o, r.ox, r.oy, r.oz, tnear);
-    TRANSPOSE16(d, r.dx, r.dy, r.dz, r.tfar);
-    r.active = r.tfar >= tnear;
-    return r;
-}
-
-inline float lowest(float16 v)
-{
-    const float8 a = v.lo < v.hi ? v.lo : v.hi;
-    const float4 b = a.lo < a.hi ? a.lo : a.hi;
-    return MIN(MIN(b.x, b.y), MIN(b.z, b.w));
-}
 
 // Boxes per chunk: low and high corner of the origins, of the ends; inf, -inf where empty.
 kernel void measure_rays(const ulong n, global const uint *restrict slots,
@@ -66,7 +35,8 @@ kernel void measure_rays(const ulong n, global const uint *restrict slots,
     for (uint k = 0; k < 6; k++)
         low[k] = INFINITY, high[k] = -INFINITY;
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
-        const Rays16 r = load_rays(i, (uint)MIN(end - i, 16ul), slots, org_tnear, dir_tfar);
+        const Rays16 r = gather_rays(i, 1, end, slots, org_tnear, dir_tfar);
+        const int16 active = r.tfar >= r.tnear;
         const float16 points[6] = {r.ox,
                                    r.oy,
                                    r.oz,
@@ -74,8 +44,8 @@ kernel void measure_rays(const ulong n, global const uint *restrict slots,
                                    FMA16(r.dy, r.tfar, r.oy),
                                    FMA16(r.dz, r.tfar, r.oz)};
         for (uint k = 0; k < 6; k++) {
-            const int16 lower = r.active & (points[k] < low[k]);
-            const int16 higher = r.active & (points[k] > high[k]);
+            const int16 lower = active & (points[k] < low[k]);
+            const int16 higher = active & (points[k] > high[k]);
             low[k] = lower ? points[k] : low[k];
             high[k] = higher ? points[k] : high[k];
         }
@@ -137,10 +107,6 @@ inline uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
 
 #else
 
-inline float16 magnitude(float16 x) { return as_float16(as_int16(x) & 0x7fffffff); }
-
-inline float16 larger(float16 a, float16 b) { return a > b ? a : b; }
-
 // The direction on the octahedron, unfolded to the square of 2^WIDE_BITS cells (Meyer et al. 2010).
 inline void octahedral(const Rays16 *r, uint16 *x, uint16 *y)
 {
@@ -200,14 +166,14 @@ kernel void hash_rays(const ulong n, global const uint *restrict slots,
 {
     const Box origins = grid[0], ends = grid[1];
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
-        const uint count = (uint)MIN(end - i, 16ul);
-        const Rays16 r = load_rays(i, count, slots, org_tnear, dir_tfar);
+        const Rays16 r = gather_rays(i, 1, end, slots, org_tnear, dir_tfar);
+        const int16 traced = r.tfar >= r.tnear;
+        const uint mask = MASK16(traced);
         uint lanes[16] __attribute__((aligned(64)));
-        *(uint16 *)lanes = hash_rays16(r, origins, ends, light) & as_uint16(r.active);
-        const uint traced = MASK16(r.active);
-        for (uint k = 0; k < count; k++) {
+        *(uint16 *)lanes = hash_rays16(r, origins, ends, light) & as_uint16(traced);
+        for (uint k = 0; k < 16 && i + k < end; k++) {
             keys[i + k] = lanes[k];
-            active[i + k] = traced >> k & 1;
+            active[i + k] = mask >> k & 1;
         }
     }
 }

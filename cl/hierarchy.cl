@@ -22,6 +22,7 @@
 // Build-time constants: ARITY; PAPER_BOUNDS for the unions of Reis et al. 2017 (cl/paper_bounds.h).
 
 #include "node.h"
+#include "rays.h"
 
 #define SINE_SLACK 0x1p-21f
 #define REACH_SLACK (1.0f + 0x1p-21f)
@@ -52,8 +53,7 @@ inline Vectors magnitudes(Vectors a)
     return (Vectors){magnitude(a.x), magnitude(a.y), magnitude(a.z)};
 }
 
-inline float16 larger(float16 a, float16 b) { return a > b ? a : b; }
-
+// Where `a` is NaN, b.
 inline Vectors larger_of_each(Vectors a, Vectors b)
 {
     return (Vectors){larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)};
@@ -103,18 +103,8 @@ inline void keep(Nodes *n, int16 live)
 inline Nodes load_rays(ulong first, uint step, uint num_slots, global const uint *slots,
                        global const float4 *org_tnear, global const float4 *dir_tfar)
 {
-    float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));
-    for (uint lane = 0; lane < 16; lane++) {
-        const ulong slot = first + lane * step;
-        const uint ray = slot < num_slots ? slots[slot] : INVALID;
-        origins[lane] = org_tnear[ray == INVALID ? 0 : ray];
-        directions[lane] = dir_tfar[ray == INVALID ? 0 : ray];
-        directions[lane].w = ray == INVALID ? -INFINITY : directions[lane].w;
-    }
-    Vectors o, d;
-    float16 tnear, tfar;
-    TRANSPOSE16(origins, o.x, o.y, o.z, tnear);
-    TRANSPOSE16(directions, d.x, d.y, d.z, tfar);
+    const Rays16 r = gather_rays(first, step, num_slots, slots, org_tnear, dir_tfar);
+    const Vectors o = {r.ox, r.oy, r.oz}, d = {r.dx, r.dy, r.dz};
 
     // Scaled by its largest component first: squares of tiny or huge ones leave the range.
     const Vectors m = magnitudes(d);
@@ -127,14 +117,14 @@ inline Nodes load_rays(ulong first, uint step, uint num_slots, global const uint
     n.axis = over(e, length);
     n.cosine = 1.0f;
     n.sine = 0.0f;
-    n.reach = tfar * scale * length * REACH_SLACK; // 0 * inf must not arise
+    n.reach = r.tfar * scale * length * REACH_SLACK; // 0 * inf must not arise
     n.origin_half = all_axes(0.0f);
-    const Vectors way = times(d, tfar), sum = plus(magnitudes(o), magnitudes(way));
+    const Vectors way = times(d, r.tfar), sum = plus(magnitudes(o), magnitudes(way));
     const int16 finite = (sum.x < FAR) & (sum.y < FAR) & (sum.z < FAR); // NaN of 0 * inf is not
     n.end_middle = choose(finite, plus(o, way), n.axis);
     n.end_half = times(choose(finite, sum, all_axes(1.0f)), END_SLACK);
     n.finite = finite ? (float16)1.0f : (float16)0.0f;
-    keep(&n, tfar >= tnear);
+    keep(&n, r.tfar >= r.tnear);
     return n;
 }
 
@@ -190,10 +180,7 @@ typedef struct {
     Vectors low, high;
 } Boxes;
 
-inline Boxes empty_boxes(void)
-{
-    return (Boxes){all_axes(INFINITY), all_axes(-INFINITY)};
-}
+inline Boxes empty_boxes(void) { return (Boxes){all_axes(INFINITY), all_axes(-INFINITY)}; }
 
 // Boxes where `live` take in the box of such extent around `middle`.
 inline void take_in(Boxes *b, int16 live, Vectors middle, Vectors extent)
@@ -274,8 +261,7 @@ inline void enclose_boxes(Nodes *n, const Nodes *children)
         const Nodes *c = children + k;
         const int16 live = is_live(c);
         const Vectors origin = plus(magnitudes(minus(c->centre, n->centre)), c->origin_half);
-        n->origin_half
-            = choose(live, larger_of_each(origin, n->origin_half), n->origin_half);
+        n->origin_half = choose(live, larger_of_each(origin, n->origin_half), n->origin_half);
         // Ends among directions: what the cone says of these, 2 sin(alpha/2) at most from its axis.
         const int16 mixed = n->finite < c->finite, narrow = c->cosine > 0.0f;
         const float16 chord = c->sine / SQRT16(0.5f + 0.5f * c->cosine) + SINE_SLACK;
@@ -292,7 +278,7 @@ inline void enclose_boxes(Nodes *n, const Nodes *children)
                         RADIUS_SLACK);
 }
 
-// The parents, where any child is not null.
+// The parents of sixteen times ARITY children, where any of these is not null.
 inline Nodes enclose(const Nodes *children)
 {
     Nodes n;

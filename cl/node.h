@@ -41,8 +41,6 @@
 #define SLACK 0x1p-19f
 #define NULL_REACH (-INFINITY)
 
-inline float16 magnitude(float16 x) { return as_float16(as_int16(x) & 0x7fffffff); }
-
 // Fused, so with fewer roundings than the bound above allows for, and a third fewer instructions.
 inline float16 dot16(float16 ax, float16 ay, float16 az, float16 bx, float16 by, float16 bz)
 {

@@ -55,19 +55,21 @@ inline void add_cones(Nodes *n, int16 joins, const Nodes *other)
     set_cones(n, joins, axis, half_across * cosine + half_along * sine, wide);
 }
 
-// Equations 7 and 8.
+// Equations 7 and 8; the radius from the middle as it was rounded, which may be by more than a radius.
 inline void add_spheres(Nodes *n, int16 joins, const Nodes *other)
 {
-    const Vectors step = times(minus(other->centre, n->centre), 0.5f);
-    const float16 radius = (length_of(step) + larger(n->radius, other->radius)) * RADIUS_SLACK;
+    const Vectors middle = plus(n->centre, times(minus(other->centre, n->centre), 0.5f));
+    const float16 radius = larger(length_of(minus(n->centre, middle)) + n->radius,
+                                  length_of(minus(other->centre, middle)) + other->radius)
+                           * RADIUS_SLACK;
     const int16 bounded = radius < INFINITY; // as in hierarchy.cl
-    const Vectors centre = choose(bounded, plus(n->centre, step), all_axes(0.0f));
+    const Vectors centre = choose(bounded, middle, all_axes(0.0f));
     n->centre = choose(joins, centre, n->centre);
     const float16 radius_or_any = bounded ? radius : INFINITY;
     n->radius = joins ? radius_or_any : n->radius;
 }
 
-// The parents, where any child is not null.
+// The parents of sixteen times ARITY children, where any of these is not null.
 inline Nodes enclose(const Nodes *children)
 {
     Nodes n = children[0];

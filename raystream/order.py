@@ -92,4 +92,4 @@ def hashed_slots(session, rays, slots, name):
         Behind the active rays 0xffffffff.
     """
     keys, active = hash.hash_rays(session, rays, slots, name)
-    return compress.coherent_slots(session, keys, slots, active, hash.BITS)[0]
+    return compress.coherent_slots(session, keys, slots, active, hash.BITS[name])[0]

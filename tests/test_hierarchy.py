@@ -134,6 +134,26 @@ def test_nodes_bound_rays_at_the_ends_of_the_range(seed, origin, direction, far,
 
 
 @pytest.mark.parametrize("bound", BOUNDS)
+@pytest.mark.parametrize("arity", [4, 8])
+def test_null_children_widen_nothing(arity, bound):
+    """Every pattern of null children, the others far from the null node's zeros."""
+    patterns = np.arange(2**arity)[:, None] >> np.arange(arity) & 1
+    tfar = np.where(patterns.ravel(), 1.0, -1.0).astype(np.float32)
+    along = np.linspace(0, 1e-3, len(tfar), dtype=np.float32)[:, None]
+    origins = np.float32([100, -100, 100]) + along
+    directions = np.float32([0, 0.6, 0.8]) + along
+    hierarchy = rs.RayHierarchy.build(stream(origins, directions, tfar), arity, bound=bound)
+    assert_bounds(hierarchy, origins, directions, tfar)
+    np.testing.assert_array_equal(hierarchy.valid[1].get()[: len(patterns)], patterns.sum(axis=1))
+    for k in range(hierarchy.num_levels + 1):
+        nodes = hierarchy.nodes(k)
+        nodes = nodes[nodes[:, 9] >= 0]
+        assert (nodes[:, [3, 8]] < 0.01).all()
+        if bound == "tight":
+            assert (nodes[:, [10, 11, 12, 16, 17, 18]] < 0.01).all() and (nodes[:, 9] < 1.01).all()
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
 def test_parallel_opposite_and_tiny_directions(bound):
     directions = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]] * 4, np.float32)
     directions[4:8] *= 1e-30

@@ -1,0 +1,26 @@
+// Sixteen rays of a stream, one to a lane. A ray is two float4: origin with tnear, direction with tfar.
+
+#include "common.h"
+
+typedef struct {
+    float16 ox, oy, oz, tnear, dx, dy, dz, tfar;
+} Rays16;
+
+// The rays in slots first, first + step, ...; inactive (tfar = -inf) from slot `stop` on and where a slot
+// holds no ray.
+inline Rays16 gather_rays(ulong first, uint step, ulong stop, global const uint *slots,
+                          global const float4 *org_tnear, global const float4 *dir_tfar)
+{
+    float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));
+    for (uint lane = 0; lane < 16; lane++) {
+        const ulong slot = first + lane * step;
+        const uint ray = slot < stop ? slots[slot] : INVALID;
+        origins[lane] = org_tnear[ray == INVALID ? 0 : ray];
+        directions[lane] = dir_tfar[ray == INVALID ? 0 : ray];
+        directions[lane].w = ray == INVALID ? -INFINITY : directions[lane].w;
+    }
+    Rays16 r;
+    TRANSPOSE16(origins, r.ox, r.oy, r.oz, r.tnear);
+    TRANSPOSE16(directions, r.dx, r.dy, r.dz, r.tfar);
+    return r;
+}
