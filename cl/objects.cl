@@ -25,6 +25,7 @@
 #include "triangle.h"
 
 #define SUPPORT 4 // vertices that hold a ball
+#define AHEAD 4 // steps that gathers look ahead: sorted triangles lie all over memory
 
 // Sixteen points or vectors.
 typedef struct {
@@ -417,6 +418,9 @@ kernel void arrange_bounds(const uint num_blocks, const uint num_triangles,
 {
     for (uint block = chunk_begin(num_blocks), end = chunk_end(num_blocks); block < end; block++) {
         global float16 *rows = bound_rows + BOUND_ROWS * (ulong)block;
+        const uint ahead = MIN(block + AHEAD, num_blocks - 1) * 16;
+        for (uint lane = 0; lane < 16; lane++)
+            PREFETCH(bounds + BOUND_FLOAT4S * (ulong)sorted[ahead + lane]);
         for (uint part = 0; part < BOUND_FLOAT4S; part++, rows += 4) {
             float4 s[16] __attribute__((aligned(64)));
             for (uint lane = 0; lane < 16; lane++)
@@ -438,6 +442,7 @@ inline void gather_clusters(uint num_triangles, uint size, uint first, global co
         for (uint lane = 0; lane < 16; lane++) {
             const ulong i = (first + lane) * (ulong)size + k;
             corners[lane] = TRIANGLE_FLOAT4S * order[MIN(i, num_triangles - 1)];
+            PREFETCH(triangles + TRIANGLE_FLOAT4S * order[MIN(i + AHEAD, num_triangles - 1)]);
         }
         for (uint corner = 0; corner < 3; corner++) {
             float4 s[16] __attribute__((aligned(64)));

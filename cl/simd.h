@@ -22,6 +22,7 @@
 //   TRANSPOSE16(s, x, y, z, w)     sixteen float4 s[] as four float16 rows
 //   CONVERT(T, v)                  lane by lane, as a cast
 //   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
+//   PREFETCH(p)                    the line at p will be read
 //   STORE_STREAMING(T, p, v)       to global memory aligned to T, past the caches
 //
 // Build-time constant: PORTABLE, where defined, keeps the x86 built-ins out.
@@ -131,6 +132,7 @@ inline ulong TEST64(global const uchar *p, uint bit)
 
 #define CONVERT(T, v) __builtin_convertvector(v, T)
 #define STORE_STREAMING(T, p, v) __builtin_nontemporal_store(v, (global T *)(p))
+#define PREFETCH(p) __builtin_prefetch((const void *)(ulong)(p))
 #define LOW_PAIRS(a, b)                                                                            \
     __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
 #define HIGH_PAIRS(a, b)                                                                           \
@@ -167,6 +169,7 @@ inline ulong TEST64(global const uchar *p, uint bit)
 
 #define CONVERT(T, v) CONVERT_(T, v)
 #define STORE_STREAMING(T, p, v) (*(global T *)(p) = (v))
+#define PREFETCH(p) prefetch(p, 1)
 #define CONVERT_(T, v) convert_##T(v)
 #define LOAD_UNALIGNED(T, p) vload16(0, p)
 #define STORE_UNALIGNED(T, p, v) vstore16(v, 0, p)
