@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent.parent))
 
+import raystream.data
 from bench_rsh import frame_rays, reflection_rays
 from real_scenes import BUNNY, COUNT_SCENES, PATIO
 
@@ -164,6 +165,33 @@ def wall_seconds(counts, stage):
 
 
 # --- Printing, writing, drawing ---
+
+
+def print_published(name, rows):
+    """The change of `crsh` against `rsh` in the paper's set-up: in the paper, and in these rows."""
+    published = published_totals(name)
+    if not published:
+        return
+    ours = {method: sum(r["total tests"] - r["mesh tests"] for r in rows
+                        if (r["kind"], r["configuration"]) in published_kinds(name, method))
+            for method in ("rsh", "crsh")}  # fmt: skip
+    print(f"\n{name}, the paper's set-up; totals without the tests of meshes, as in the paper")
+    for place, totals in (("Reis et al.", published), ("here", ours)):
+        change = totals["crsh"] / totals["rsh"] - 1
+        print(f"  {place:<12} rsh {totals['rsh']:>13,}  crsh {totals['crsh']:>13,}  {change:+.1%}")
+
+
+def published_totals(name):
+    """Table 4 of Reis et al. for a scene: total tests by method; empty for other scenes."""
+    with open(pathlib.Path(raystream.data.__file__).parent / "crsh17.csv", newline="") as file:
+        table = [r for r in csv.DictReader(file) if (r["scene"], r["level"]) == (name, "total")]
+    return {r["algorithm"]: int(r["tests"]) for r in table}
+
+
+def published_kinds(name, method):
+    """(kind, configuration) of the rows that the paper's table has for a scene."""
+    kinds = (SHADOW, MIRROR) if name == CORNELL else (SHADOW,)
+    return [(kind, {"rsh": "rsh", "crsh": "crsh paper"}[method]) for kind in kinds]
 
 
 def columns(rows):
@@ -308,6 +336,7 @@ def main():
             runs = count(scene, kind, of_kind, options.repeats)
             rows += [row(name, kind, run, runs[0]) for run in runs]
             print_table(rows[-len(runs) :])
+        print_published(name, [r for r in rows if r["scene"] == name])
         device.session().trim()  # the next scene's streams are of other sizes
     if options.output:
         write_csv(options.output / "counts.csv", rows)

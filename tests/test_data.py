@@ -1,0 +1,30 @@
+"""The published figures: the paper's own arithmetic holds for what was copied."""
+
+import csv
+import pathlib
+
+import pytest
+import raystream.data
+
+FOLDER = pathlib.Path(raystream.data.__file__).parent
+
+
+def rows(**wanted):
+    with open(FOLDER / "crsh17.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    return [r for r in table if all(r[key] == value for key, value in wanted.items())]
+
+
+@pytest.mark.parametrize("algorithm", ["rsh", "crsh"])
+@pytest.mark.parametrize("scene", ["office", "cornell", "sponza"])
+def test_counts_of_the_coherent_hierarchy_tie_up(scene, algorithm):
+    parts = {"scene": scene, "algorithm": algorithm}
+    tests = 0
+    for above, below in zip(rows(level="2", **parts), rows(level="1", **parts), strict=True):
+        assert above["rays"] == below["rays"]
+        for row in (above, below):
+            assert int(row["misses"]) + int(row["hits"]) == int(row["tests"])
+        assert int(below["tests"]) == 8 * int(above["hits"])
+        tests += int(above["tests"]) + int(below["tests"]) + 8 * int(below["hits"])
+    (total,) = rows(level="total", **parts)
+    assert int(total["tests"]) == tests
