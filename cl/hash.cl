@@ -11,8 +11,9 @@
 //              the end, END_BITS an axis, says more than the direction: also how far they reach.
 //              Where such rays have no end, WIDE_BITS of the direction are all there is.
 //
-// Cells divide the box of the origins of the rays at hand, and that of their ends, into 2^CELL_BITS
-// along every axis; the boxes are measured first. Equal keys keep the order of the slots, so coherence on the screen survives.
+// Cells divide the box of the origins of the rays at hand, or that of their ends, evenly along every
+// axis; the boxes are measured first. Equal keys keep the order of the slots, so that coherence on the
+// screen survives.
 //
 // Build-time constants: CHUNKS, CELL_BITS (of a coordinate of the origin); HASH_PAPER,
 // ANGLE_BITS, SHADOW_ANGLE_BITS, or COARSE_BITS, FINE_BITS, WIDE_BITS, END_BITS.

@@ -6,8 +6,9 @@
 // point whichever triangle it is seen from, and the 2-D edge functions below have the exact sign for
 // these points; so a ray through a shared edge or vertex always hits one of the triangles there.
 // The paper falls back to double precision where an edge function is zero; a difference of products
-// by Kahan's method is within 1.5 ulp of the exact value of its float inputs, hence never zero or of
-// the wrong sign by rounding (products of coordinates below 1e-19 underflow) (Jeannerod, Louvet, Muller 2013), and needs no second precision.
+// by Kahan's method (Jeannerod, Louvet, Muller 2013) is within 1.5 ulp of the exact value of its float
+// inputs, hence never zero or of the wrong sign by rounding, and needs no second precision (products of
+// coordinates below 1e-19 underflow).
 //
 // The vector forms do the same operations in the same order: hits are equal bit for bit.
 
