@@ -58,10 +58,12 @@ inline int16 node_meets_sphere(float16 cx, float16 cy, float16 cz, float16 r, fl
     const float16 h = dot16(wx, wy, wz, ax, ay, az);
     const float16 kx = FMA16(wy, az, -(wz * ay)), ky = FMA16(wz, ax, -(wx * az)),
                   kz = FMA16(wx, ay, -(wy * ax));
-    const float16 p2 = dot16(kx, ky, kz, kx, ky, kz);
+    // The cosine first: the square of a distance may leave the range of float where it decides nothing.
+    const float16 lx = kx * cosine, ly = ky * cosine, lz = kz * cosine;
+    const float16 p2 = dot16(lx, ly, lz, lx, ly, lz);
     const float16 q = FMA16(h, sine, s);
     const float16 far = reach + s;
-    const int16 in_cone = (q >= 0.0f) & (p2 * cosine * cosine <= q * q) & (h >= -s);
+    const int16 in_cone = (q >= 0.0f) & (p2 <= q * q) & (h >= -s);
     const int16 in_reach = (far >= 0.0f) & (dot16(wx, wy, wz, wx, wy, wz) <= far * far);
     return in_reach & (in_cone | (cosine <= 0.0f));
 }
@@ -97,8 +99,8 @@ inline int16 node_meets_slabs(global const float *rows, const float16 *p)
     const float16 ends_half
         = dot16(sx, sy, sz, NODE_FIELD(rows, 16), NODE_FIELD(rows, 17), NODE_FIELD(rows, 18))
           + FMA16(finite, thickness, SLACK * (magnitude(vx) + magnitude(vy) + magnitude(vz)));
-    const int16 above = (origins > origins_half) & (ends >= ends_half);
-    const int16 below = (origins < -origins_half) & (ends <= -ends_half);
+    const int16 above = (origins > origins_half) & (ends > ends_half);
+    const int16 below = (origins < -origins_half) & (ends < -ends_half);
     return ~(above | below);
 }
 
@@ -126,7 +128,11 @@ inline int16 node_meets_boxes(global const float *rows, const float16 *p)
     const float16 ball = length * s;
     const float16 half_width = FMA16(length, slack, box < ball ? box : ball);
     const float16 depth = dot16(magnitude(ax), magnitude(ay), magnitude(az), bx, by, bz) + slack;
-    const int16 apart = (dot16(mx, my, mz, wx, wy, wz) > half_width) | (h < -depth);
+    const float16 height = dot16(mx, my, mz, wx, wy, wz);
+    // P on the axis, but for rounding, is in the cone, and its normal is noise; nor does an infinite
+    // height say anything.
+    const int16 beside = (height > half_width) & (height < INFINITY) & (length > slack);
+    const int16 apart = beside | (h < -depth);
     const float16 far = NODE_FIELD(rows, 9) + s + slack;
     const int16 in_reach = (far >= 0.0f) & (dot16(wx, wy, wz, wx, wy, wz) <= far * far);
     return in_reach & (~apart | (cosine <= 0.0f));

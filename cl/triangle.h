@@ -77,7 +77,7 @@ typedef struct {
     }                                                                                              \
                                                                                                    \
     /* The rest. A zero determinant (edge-on or zero-area) is a miss; comparisons with its NaN are \
-       false. + 0.0f turns -0.0 into 0.0, which sorts first among the bit patterns. Weights before \
+       false. So is one that left the range of float, whose t would be 0. + 0.0f turns -0.0 into 0.0, which sorts first among the bit patterns. Weights before \
        depths: edges times depths would leave the range of float in large and tiny scenes. */      \
     inline HIT finish_hit##SUFFIX(const FRAME *r, I inside, const F *edges, const F *depths)       \
     {                                                                                              \
@@ -86,7 +86,8 @@ typedef struct {
         h.u = edges[1] / det;                                                                      \
         h.v = edges[2] / det;                                                                      \
         h.t = edges[0] / det * depths[0] + h.u * depths[1] + h.v * depths[2] + 0.0f;               \
-        h.hit = inside & (det != 0.0f) & (h.t >= (F)(r->tnear)) & (h.t <= (F)(r->tfar));           \
+        h.hit = inside & (det != 0.0f) & (det - det == 0.0f) & (h.t >= (F)(r->tnear))              \
+                & (h.t <= (F)(r->tfar));                                                           \
         return h;                                                                                  \
     }
 

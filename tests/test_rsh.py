@@ -76,6 +76,41 @@ def test_rays_aimed_at_edges_and_vertices_of_a_closed_mesh_hit():
         assert (hits.prim_id >= 0).all(), method
 
 
+@pytest.mark.parametrize("method", ["rsh", "crsh"])
+def test_a_triangle_centred_on_the_axis_is_kept(method):
+    """What is left of P across the axis is rounding, whose square is zero."""
+    corners = [[[0.9375, 1.0625, 1], [1.0625, 0.9375, 1], [1.03125, 1.03125, 0.9375]]]
+    scene = rs.Scene([mesh_of("diagonal", np.array(corners, np.float32))])
+    hits = rs.Tracer(scene, method).intersect(np.zeros((1, 3)), np.ones((1, 3)))
+    assert hits.prim_id[0] == 0 and hits.t[0] == 1
+
+
+@pytest.mark.parametrize("method", ["rsh", "crsh"])
+def test_voxels_seen_along_their_diagonal(method):
+    """Rays through vertices and edges of a grid, along the diagonal of its cells."""
+    x, y, z = (a.ravel() for a in np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"))
+    square = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
+    corners = np.zeros((len(x), 2, 3, 3))
+    corners[..., :2] = np.stack([x, y], axis=-1)[:, None, None] + square
+    corners[..., 2] = z[:, None, None]
+    scene = rs.Scene([mesh_of("sheets", corners.reshape(-1, 3, 3).astype(np.float32))])
+    starts = np.stack(np.meshgrid(*[np.arange(0, 3, 0.5)] * 3), axis=-1).reshape(-1, 3) - 0.5
+    arguments = starts, np.ones_like(starts)
+    ours, brute = (rs.Tracer(scene, name) for name in (method, "brute"))
+    assert_same_hits(ours.intersect(*arguments), brute.intersect(*arguments))
+    assert ours.statistics.final_hits == brute.statistics.final_hits > 100
+
+
+@pytest.mark.parametrize("method", ["rsh", "crsh"])
+def test_scenes_near_the_limits_of_float(method, rng):
+    for exponent in (-18, -12, 12, 18):
+        centre = rng.normal(size=3) * 10.0**exponent
+        size = 10.0 ** (exponent - 1)
+        corners = centre + size * rng.normal(size=(64, 3, 3))
+        scene = rs.Scene([mesh_of("far", corners.astype(np.float32))])
+        assert_nothing_lost(scene, np.zeros((64, 3)), corners.mean(axis=1) / np.abs(centre).max())
+
+
 def grid_of_rays(width, height):
     camera = rs.Camera.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.5), fov_y=30.0)
     return rays.from_camera(device.session(), camera, (width, height))
