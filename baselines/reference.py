@@ -93,7 +93,7 @@ def render_reference(
     tracer = EmbreeTracer.from_scene(scene) if tracer is None else tracer
     total, first_hits = np.zeros((height * width, 3)), None
     for sample in range(samples):
-        rays = _primary_rays(camera, size, (0.5 + sample * R2) % 1)
+        rays = primary_rays(camera, size, (0.5 + sample * R2) % 1)
         radiance, hits = _trace(scene, tracer, rays, max_bounces, shadows)
         first_hits = hits if first_hits is None else first_hits
         total += radiance
@@ -104,7 +104,7 @@ def render_reference(
     )
 
 
-def _primary_rays(camera, size, place):
+def primary_rays(camera, size, place):
     """Return one ray through (x, y) = `place` of each pixel, row by row from the top."""
     width, height = size
     right, up, forward = (np.asarray(axis, np.float64) for axis in camera.basis)
@@ -129,16 +129,16 @@ def _trace(scene, tracer, rays, max_bounces, shadows):
         if not len(rays.pixels):
             break
         directions = normalised(rays.directions)
-        points = surface_points(scene, _select(hits, hit), directions)
-        offset = _offset(scene.bounds)
+        points = surface_points(scene, select_hits(hits, hit), directions)
+        offset = ray_offset(scene.bounds)
         shadow_tracer = tracer if shadows else None
-        _add(radiance, rays, _shade(scene, points, directions, offset, shadow_tracer))
+        _add(radiance, rays, shade(scene, points, directions, offset, shadow_tracer))
         if bounces_left:
-            rays = _secondary_rays(rays.weights, rays.pixels, points, directions, offset)
+            rays = secondary_rays(rays.weights, rays.pixels, points, directions, offset)
     return radiance, primary_hits
 
 
-def _select(hits, rows):
+def select_hits(hits, rows):
     return Hits(*(values[rows] for values in (hits.t, hits.prim_id, hits.geom_id, hits.u, hits.v)))
 
 
@@ -147,7 +147,7 @@ def _add(radiance, rays, colours):
     np.add.at(radiance, rays.pixels, rays.weights * colours)
 
 
-def _offset(bounds):
+def ray_offset(bounds):
     """Return how far secondary rays start from a surface, against hitting it again."""
     bounds = np.asarray(bounds, np.float64)
     diagonal = np.linalg.norm(bounds[1] - bounds[0])
@@ -155,7 +155,7 @@ def _offset(bounds):
     return max(1e-5 * diagonal, 4 * float(ulp))
 
 
-def _shade(scene, points, directions, offset, shadow_tracer):
+def shade(scene, points, directions, offset, shadow_tracer):
     """Return the radiance (n, 3) that leaves the points without further specular bounces."""
     opaque = (1 - points.transmission) * (1 - points.reflectivity)
     colour = points.emission + np.asarray(scene.ambient, np.float64) * points.base * opaque
@@ -164,7 +164,7 @@ def _shade(scene, points, directions, offset, shadow_tracer):
     return colour
 
 
-def _secondary_rays(weights, pixels, points, directions, offset):
+def secondary_rays(weights, pixels, points, directions, offset):
     """Return the reflected and refracted rays whose weight still counts."""
     normals = _specular_normals(points, directions)
     eta = np.where(points.entering[:, None], 1 / points.ior, points.ior)

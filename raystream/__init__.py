@@ -10,6 +10,7 @@ from raystream._version import __version__
 from raystream.camera import Camera
 from raystream.device import devices
 from raystream.hierarchy import RayHierarchy
+from raystream.ldc import LayeredDepthCube
 from raystream.light import DirectionalLight, PointLight, SpotLight
 from raystream.material import Material
 from raystream.mesh import Mesh
@@ -22,6 +23,7 @@ __all__ = [
     "DirectionalLight",
     "Frame",
     "Hits",
+    "LayeredDepthCube",
     "Material",
     "Mesh",
     "PointLight",

@@ -14,11 +14,17 @@ from raystream.brute import Brute
 from raystream.checks import as_float_array, check_choice, check_count, check_rows
 from raystream.crsh import CoherentTracer
 from raystream.geometry import Geometry
+from raystream.ldc import LayeredDepthCubeTracer
 from raystream.rsh import RayspaceTracer
 from raystream.scene import as_scene
 from raystream.statistics import Statistics
 
-_METHODS = {"brute": Brute, "rsh": RayspaceTracer, "crsh": CoherentTracer}
+_METHODS = {
+    "brute": Brute,
+    "rsh": RayspaceTracer,
+    "crsh": CoherentTracer,
+    "ldc": LayeredDepthCubeTracer,
+}
 _COMMON = ("self", "session", "geometry", "memory_limit")
 # The default memory_limit: a part of the device's memory, and no more than needed to be fast.
 _MEMORY_SHARE = 4
@@ -67,7 +73,8 @@ class Tracer:
         Bytes that the candidates of one call may take; default: 1 GiB, or a quarter of the device's
         memory where that is less.
     **options
-        Of the method: see `raystream.rsh.RayspaceTracer`, `raystream.crsh.CoherentTracer`.
+        Of the method: see `raystream.rsh.RayspaceTracer`, `raystream.crsh.CoherentTracer`,
+        `raystream.ldc.LayeredDepthCubeTracer`.
 
     Attributes
     ----------

@@ -24,3 +24,8 @@ def random_rays(rng, count, spread=1.0):
     origins = (rng.random((count, 3)) * (1 + 2 * spread) - spread).astype(np.float32)
     directions = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-3, 3, (count, 1))
     return origins, directions.astype(np.float32)
+
+
+def exact_tracer(scene, method):
+    """A tracer whose hits are exact: `ldc` as published is not."""
+    return rs.Tracer(scene, method, **({"exact": True} if method == "ldc" else {}))

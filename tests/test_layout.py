@@ -25,7 +25,7 @@ TIERS = (
     {"objects", "order", "intersect", "rasterize", "shade", "stream"},
     {"hierarchy"},
     {"traverse"},
-    {"brute", "rsh"},
+    {"brute", "rsh", "ldc"},
     {"crsh"},
     {"tracer", "host_tracer"},
     {"renderer"},

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from soup import random_rays, triangle_soup
+from soup import exact_tracer, random_rays, triangle_soup
 
 import raystream as rs
 from raystream import device, program
@@ -26,10 +26,10 @@ def path(request):
 def test_hits_and_counts_are_the_same_on_both_paths(method, request, rng):
     scene = triangle_soup(rng, 700, size=0.3)
     rays = random_rays(rng, 1009)
-    first = rs.Tracer(scene, method)
+    first = exact_tracer(scene, method)
     expected, counts = first.intersect(*rays), first.statistics
     request.getfixturevalue("portable")
-    second = rs.Tracer(scene, method)
+    second = exact_tracer(scene, method)
     hits = second.intersect(*rays)
     for field in ("t", "prim_id", "geom_id", "u", "v"):
         np.testing.assert_array_equal(getattr(hits, field), getattr(expected, field), field)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from raystream.baselines import BruteForceTracer, EmbreeTracer
 from raystream.baselines.tolerance import differing, differing_occlusion
-from soup import random_rays, triangle_soup
+from soup import exact_tracer, random_rays, triangle_soup
 
 import raystream as rs
 
@@ -22,7 +22,7 @@ def method(request):
 
 
 def test_methods_are_listed():
-    assert METHODS == ["brute", "rsh", "crsh"]
+    assert METHODS == ["brute", "rsh", "crsh", "ldc"]
 
 
 @pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 64, 65, 1009])
@@ -30,7 +30,7 @@ def test_hits_equal_the_float64_oracle(rng, method, count):
     scene = triangle_soup(rng, 200)
     triangles = (scene.vertices, scene.faces, scene.first_prims)
     origins, directions = random_rays(rng, count)
-    tracer, oracle = rs.Tracer(scene, method), BruteForceTracer(*triangles)
+    tracer, oracle = exact_tracer(scene, method), BruteForceTracer(*triangles)
     arguments = (origins, directions, 0.01, 3.0)
     hits = tracer.intersect(*arguments)
     agreement = differing(hits, oracle.intersect(*arguments), *triangles, *arguments)
@@ -44,7 +44,7 @@ def test_hits_equal_the_float64_oracle(rng, method, count):
 def test_the_hit_point_is_where_the_ray_is(rng, method):
     scene = triangle_soup(rng, 400, size=0.6)
     origins, directions = random_rays(rng, 2000, spread=0.2)
-    hits = rs.Tracer(scene, method).intersect(origins, directions)
+    hits = exact_tracer(scene, method).intersect(origins, directions)
     hit = hits.prim_id >= 0
     assert 100 < hit.sum() < 2000
     flat = scene.first_prims[hits.geom_id[hit]] + hits.prim_id[hit]
@@ -57,14 +57,15 @@ def test_the_hit_point_is_where_the_ray_is(rng, method):
 
 
 def test_types_of_the_results(method):
-    hits = rs.Tracer(rs.scenes.cornell(), method).intersect([[278, 273, -800]], [[0, 0, 1]])
+    hits = exact_tracer(rs.scenes.cornell(), method).intersect([[278, 273, -800]], [[0, 0, 1]])
     types = {name: getattr(hits, name).dtype for name in ("t", "prim_id", "geom_id", "u", "v")}
     assert types == {"t": np.float32, "prim_id": np.int32, "geom_id": np.int32,
                      "u": np.float32, "v": np.float32}  # fmt: skip
 
 
 def test_segments_are_closed_and_in_units_of_the_direction(method):
-    tracer = rs.Tracer(trimesh.Trimesh([[-9, -9, 2], [9, -9, 2], [0, 9, 2]], [[0, 1, 2]]), method)
+    mesh = trimesh.Trimesh([[-9, -9, 2], [9, -9, 2], [0, 9, 2]], [[0, 1, 2]])
+    tracer = exact_tracer(mesh, method)
     rays = np.zeros((6, 3)), np.tile([0, 0, 4.0], (6, 1))
     tnear = [0, 0.5, 0.500001, 0, 0, 1]
     tfar = [np.inf, np.inf, np.inf, 0.5, 0.499999, 0]  # the last: tfar < tnear, inactive
@@ -90,7 +91,7 @@ def test_arrays_of_any_real_type_and_order(form):
 
 
 def test_no_rays_give_typed_empty_results(method):
-    tracer = rs.Tracer(trimesh.creation.box(), method)
+    tracer = exact_tracer(trimesh.creation.box(), method)
     hits = tracer.intersect(np.zeros((0, 3)), np.zeros((0, 3)))
     assert hits.t.shape == (0,) and hits.prim_id.dtype == np.int32
     blocked = tracer.occluded(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -99,7 +100,7 @@ def test_no_rays_give_typed_empty_results(method):
 
 
 def test_no_triangles_give_misses(method):
-    tracer = rs.Tracer(rs.Scene([]), method)
+    tracer = exact_tracer(rs.Scene([]), method)
     hits = tracer.intersect(np.zeros((3, 3)), np.ones((3, 3)))
     assert (hits.prim_id == -1).all() and np.isposinf(hits.t).all()
     assert not tracer.occluded(np.zeros((3, 3)), np.ones((3, 3))).any()
@@ -107,7 +108,8 @@ def test_no_triangles_give_misses(method):
 
 def test_zero_area_triangles_are_never_hit(method):
     corners = np.array([[0, 0, 1], [1, 1, 1], [1, 1, 1], [0, 0, 1], [0.5, 0.5, 1], [1, 1, 1]])
-    tracer = rs.Tracer(trimesh.Trimesh(corners, [[0, 1, 2], [3, 4, 5]], process=False), method)
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [3, 4, 5]], process=False)
+    tracer = exact_tracer(mesh, method)
     hits = tracer.intersect([[0, 0, 0], [0.5, 0.5, 0], [1, 1, 0]], [[0, 0, 1]] * 3)
     assert (hits.prim_id == -1).all()
 
@@ -141,7 +143,7 @@ def test_strings_are_refused():
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"method": "bvh"}, "method: need one of 'brute', 'rsh', 'crsh', got 'bvh'"),
+    ({"method": "bvh"}, "method: need one of 'brute', 'rsh', 'crsh', 'ldc', got 'bvh'"),
     ({"method": "rsh", "speed": 3}, "no option 'speed'; its options: arity, levels, reduction"),
     ({"method": "brute", "arity": 4}, "no option 'arity'; its options: none"),
     ({"arity": 5}, "arity: need one of 4, 8, got 5"),
@@ -156,14 +158,14 @@ def test_bad_options_are_refused(options, message):
 
 def test_moving_vertices(rng, method):
     scene = triangle_soup(rng, 100)
-    tracer = rs.Tracer(scene, method)
+    tracer = exact_tracer(scene, method)
     rays = random_rays(rng, 500)
     moved = scene.vertices + np.float32(0.3)
     before = tracer.intersect(*rays)
     tracer.update_vertices(moved)
     after = tracer.intersect(*rays)
     assert (after.prim_id != before.prim_id).any()
-    fresh = rs.Tracer(scene.with_vertices(moved), method).intersect(*rays)
+    fresh = exact_tracer(scene.with_vertices(moved), method).intersect(*rays)
     np.testing.assert_array_equal(after.t, fresh.t)
     np.testing.assert_array_equal(after.prim_id, fresh.prim_id)
     tracer.update_vertices(scene.vertices)
@@ -188,7 +190,7 @@ def test_bad_vertices_are_refused_and_change_nothing(rng):
 def test_device_arrays_in_device_arrays_out(rng, session, method, own_context):
     context = cl.Context([session.device]) if own_context else session.context
     queue = cl.CommandQueue(context)
-    tracer = rs.Tracer(triangle_soup(rng, 100), method)
+    tracer = exact_tracer(triangle_soup(rng, 100), method)
     origins, directions = random_rays(rng, 300)
     tfar = rng.random(300).astype(np.float32) * 10
     expected = tracer.intersect(origins, directions, 0.0, tfar)
@@ -240,7 +242,7 @@ def test_embree_agrees_on_a_large_soup(rng, method):
     scene = triangle_soup(rng, 5000, size=0.05)
     triangles = (scene.vertices, scene.faces, scene.first_prims)
     rays = random_rays(rng, 4096)
-    hits = rs.Tracer(scene, method).intersect(*rays)
+    hits = exact_tracer(scene, method).intersect(*rays)
     agreement = differing(hits, EmbreeTracer.from_scene(scene).intersect(*rays), *triangles, *rays)
     assert agreement.num_wrong == 0, agreement
 
