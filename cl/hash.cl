@@ -27,16 +27,15 @@ typedef struct {
     float4 extent; // infinite or NaN where a ray has no end
 } Box;
 
-// Boxes per chunk: low and high corner of the origins, of the ends; inf, -inf where empty.
-kernel void measure_rays(const ulong n, global const uint *restrict slots,
-                         global const float4 *restrict org_tnear,
+// Boxes per chunk of all rays: low and high corner of the origins, of the ends; inf, -inf where empty.
+kernel void measure_rays(const ulong n, global const float4 *restrict org_tnear,
                          global const float4 *restrict dir_tfar, global float4 *restrict corners)
 {
     float16 low[6], high[6];
     for (uint k = 0; k < 6; k++)
         low[k] = INFINITY, high[k] = -INFINITY;
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
-        const Rays16 r = gather_rays(i, 1, end, slots, org_tnear, dir_tfar);
+        const Rays16 r = load_rays(i, end, org_tnear, dir_tfar);
         const int16 active = r.tfar >= r.tnear;
         const float16 points[6] = {r.ox,
                                    r.oy,
@@ -169,12 +168,18 @@ kernel void hash_rays(const ulong n, global const uint *restrict slots,
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
         const Rays16 r = gather_rays(i, 1, end, slots, org_tnear, dir_tfar);
         const int16 traced = r.tfar >= r.tnear;
-        const uint mask = MASK16(traced);
-        uint lanes[16] __attribute__((aligned(64)));
-        *(uint16 *)lanes = hash_rays16(r, origins, ends, light) & as_uint16(traced);
-        for (uint k = 0; k < 16 && i + k < end; k++) {
-            keys[i + k] = lanes[k];
-            active[i + k] = mask >> k & 1;
+        const uint16 hashes = hash_rays16(r, origins, ends, light) & as_uint16(traced);
+        const uchar16 flags = CONVERT(uchar16, -traced);
+        if (i + 16 <= end) {
+            STORE_UNALIGNED(uint16, keys + i, hashes);
+            STORE_UNALIGNED(uchar16, active + i, flags);
+            continue;
         }
+        uint key_lanes[16] __attribute__((aligned(64)));
+        uchar flag_lanes[16] __attribute__((aligned(16)));
+        *(uint16 *)key_lanes = hashes;
+        *(uchar16 *)flag_lanes = flags;
+        for (uint k = 0; i + k < end; k++)
+            keys[i + k] = key_lanes[k], active[i + k] = flag_lanes[k];
     }
 }

@@ -100,7 +100,7 @@ inline void keep(Nodes *n, int16 live)
 
 // The rays of slots first, first + step, .. as nodes; null where there is no slot, no ray in it, or an
 // inactive one (tfar < tnear).
-inline Nodes load_rays(ulong first, uint step, uint num_slots, global const uint *slots,
+inline Nodes rays_as_nodes(ulong first, uint step, uint num_slots, global const uint *slots,
                        global const float4 *org_tnear, global const float4 *dir_tfar)
 {
     const Rays16 r = gather_rays(first, step, num_slots, slots, org_tnear, dir_tfar);
@@ -167,7 +167,7 @@ kernel void build_leaves(const uint num_leaves, const uint num_slots,
 {
     const ulong first = (ulong)get_global_id(0) * 16;
     store_nodes(blocks, first, num_leaves,
-                load_rays(first, 1, num_slots, slots, org_tnear, dir_tfar));
+                rays_as_nodes(first, 1, num_slots, slots, org_tnear, dir_tfar));
 }
 
 #ifdef PAPER_BOUNDS
@@ -328,6 +328,6 @@ kernel void build_parents_of_rays(const uint num_slots, const uint num_parents,
     const ulong first = (ulong)get_global_id(0) * 16;
     Nodes children[ARITY];
     for (uint k = 0; k < ARITY; k++)
-        children[k] = load_rays(first * ARITY + k, ARITY, num_slots, slots, org_tnear, dir_tfar);
+        children[k] = rays_as_nodes(first * ARITY + k, ARITY, num_slots, slots, org_tnear, dir_tfar);
     build(first, num_parents, children, parent_blocks, valid);
 }

@@ -2,9 +2,33 @@
 
 #include "common.h"
 
+#define AHEAD 32 // slots that gathers look ahead: sorted rays lie all over memory
+
 typedef struct {
     float16 ox, oy, oz, tnear, dx, dy, dz, tfar;
 } Rays16;
+
+inline Rays16 transpose_rays(const float4 *origins, const float4 *directions)
+{
+    Rays16 r;
+    TRANSPOSE16(origins, r.ox, r.oy, r.oz, r.tnear);
+    TRANSPOSE16(directions, r.dx, r.dy, r.dz, r.tfar);
+    return r;
+}
+
+// The rays first, first + 1, ...; inactive (tfar = -inf) from `stop` on.
+inline Rays16 load_rays(ulong first, ulong stop, global const float4 *org_tnear,
+                        global const float4 *dir_tfar)
+{
+    float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));
+    for (uint lane = 0; lane < 16; lane++) {
+        const ulong ray = MIN(first + lane, stop - 1);
+        origins[lane] = org_tnear[ray];
+        directions[lane] = dir_tfar[ray];
+        directions[lane].w = first + lane < stop ? directions[lane].w : -INFINITY;
+    }
+    return transpose_rays(origins, directions);
+}
 
 // The rays in slots first, first + step, ...; inactive (tfar = -inf) from slot `stop` on and where a slot
 // holds no ray.
@@ -15,12 +39,12 @@ inline Rays16 gather_rays(ulong first, uint step, ulong stop, global const uint 
     for (uint lane = 0; lane < 16; lane++) {
         const ulong slot = first + lane * step;
         const uint ray = slot < stop ? slots[slot] : INVALID;
+        const uint soon = slots[MIN(slot + AHEAD * step, stop - 1)];
+        PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));
+        PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));
         origins[lane] = org_tnear[ray == INVALID ? 0 : ray];
         directions[lane] = dir_tfar[ray == INVALID ? 0 : ray];
         directions[lane].w = ray == INVALID ? -INFINITY : directions[lane].w;
     }
-    Rays16 r;
-    TRANSPOSE16(origins, r.ox, r.oy, r.oz, r.tnear);
-    TRANSPOSE16(directions, r.dx, r.dy, r.dz, r.tfar);
-    return r;
+    return transpose_rays(origins, directions);
 }

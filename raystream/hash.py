@@ -46,12 +46,12 @@ def hash_rays(session, rays, slots, name):
     keys, active = session.empty(count, np.uint32), session.empty(count, np.uint8)
     corners, grid = (session.empty((n, 2, 4), np.float32) for n in (2 * chunks, 2))
     light = np.uint32(0xFFFFFFFF if rays.light is None else rays.light)
-    stream = np.uint64(count), slots, rays.org_tnear, rays.dir_tfar
+    stream = rays.org_tnear, rays.dir_tfar
 
     def launch(kernel, size, *args):
         session.launch(RAY_CREATION, kernels[kernel], size, *args)
 
-    launch("measure_rays", chunks, *stream, corners)
+    launch("measure_rays", chunks, np.uint64(len(rays)), *stream, corners)
     launch("make_grid", 1, corners, grid)
-    launch("hash_rays", chunks, *stream, grid, light, keys, active)
+    launch("hash_rays", chunks, np.uint64(count), slots, *stream, grid, light, keys, active)
     return keys, active
