@@ -37,6 +37,8 @@ kernel void measure_rays(const ulong n, global const float4 *restrict org_tnear,
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
         const Rays16 r = load_rays(i, end, org_tnear, dir_tfar);
         const int16 active = r.tfar >= r.tnear;
+        if (MASK16(active) == 0)
+            continue;
         const float16 points[6] = {r.ox,
                                    r.oy,
                                    r.oz,
@@ -168,7 +170,9 @@ kernel void hash_rays(const ulong n, global const uint *restrict slots,
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
         const Rays16 r = gather_rays(i, 1, end, slots, org_tnear, dir_tfar);
         const int16 traced = r.tfar >= r.tnear;
-        const uint16 hashes = hash_rays16(r, origins, ends, light) & as_uint16(traced);
+        uint16 hashes = 0;
+        if (MASK16(traced)) // many a stream has few rays
+            hashes = hash_rays16(r, origins, ends, light) & as_uint16(traced);
         const uchar16 flags = CONVERT(uchar16, -traced);
         if (i + 16 <= end) {
             STORE_UNALIGNED(uint16, keys + i, hashes);

@@ -47,7 +47,7 @@ _RENDER_EXAMPLES = """examples:
   raystream render sponza.obj -o atrium.png --eye -12,4,0 --target 0,3,1 --mirror-ball 0,2,0,1.5
 """
 _COMPARE_EXAMPLES = """examples:
-  raystream compare demo --methods rsh,embree -o demo
+  raystream compare demo --methods crsh,rsh,embree -o demo
   raystream compare bunny.ply --methods rsh,brute,embree --mirror '*'
   raystream compare cornell --methods rsh:arity=8:levels=2,rsh --counts
 """
@@ -103,7 +103,7 @@ def _add_render(commands):
     _add_scene(command)
     command.add_argument("-o", "--output", required=True, help="picture: .png .jpg .exr .npy")
     command.add_argument(
-        "--method", default="rsh", help=f"one of {', '.join(methods())}; {_METHOD_HELP}"
+        "--method", default="crsh", help=f"one of {', '.join(methods())}; {_METHOD_HELP}"
     )
     command.add_argument("--samples", type=int, default=1, help="samples per pixel")
     command.add_argument(
@@ -124,7 +124,7 @@ def _add_compare(commands):
     _add_scene(command)
     command.add_argument(
         "--methods",
-        default="rsh,brute,embree",
+        default="crsh,rsh,embree",
         help=f"of {', '.join(methods())} and embree, with commas between (default: %(default)s); "
         + _METHOD_HELP,
     )

@@ -58,7 +58,7 @@ def render(
     scene,
     camera=None,
     size=(512, 512),
-    method="rsh",
+    method="crsh",
     max_bounces=2,
     shadows=True,
     samples=1,
@@ -112,7 +112,7 @@ class Renderer:
         As for `render`.
     """
 
-    def __init__(self, scene, method="rsh", device=None, **options):
+    def __init__(self, scene, method="crsh", device=None, **options):
         self.scene = as_scene(scene)
         self._tracer = _tracer(self.scene, method, device, options)
         if device is None and isinstance(self._tracer, Tracer):

@@ -89,7 +89,7 @@ class Tracer:
         No usable OpenCL device.
     """
 
-    def __init__(self, scene, method="rsh", device=None, memory_limit=None, **options):
+    def __init__(self, scene, method="crsh", device=None, memory_limit=None, **options):
         check_choice("method", method, methods())
         _check_options(method, options)
         if memory_limit is not None:

@@ -84,7 +84,7 @@ def test_counts_are_printed_where_asked(capsys):
     arguments = ("compare", "cornell", "--methods", "rsh:arity=8:levels=2,rsh", "--size", "48x48")
     plain, counted = run(capsys, *arguments), run(capsys, *arguments, "--counts")
     assert plain[0] == counted[0] == 0
-    frame = rs.render(rs.scenes.cornell(), size=(48, 48), arity=8, levels=2)
+    frame = rs.render(rs.scenes.cornell(), size=(48, 48), method="rsh", arity=8, levels=2)
     lines, shadows = counted[1].splitlines(), frame.kinds["shadow"]
     assert f"rsh:arity=8:levels=2: {shadows.rays:,} rays x 32 triangles" in lines
     top = shadows.levels[0]
