@@ -20,7 +20,7 @@
 // and the watertight test's own perturbation, below 16 u (|w| + s)) is covered by adding
 // SLACK * (|wx| + |wy| + |wz| + s), SLACK = 32 u, to s.
 //
-// Two tests of our own, beside the sphere's, where bounds are not the paper's (PAPER_BOUNDS):
+// Two tests of our own, beside the sphere's. They cost as much again, and pay where triangles are large or long:
 // Segments lie in the hull of their origins and ends: where both boxes are on one side of the
 // triangle's slab, no ray of the node meets it. A ray without an end stays on its side where it does
 // not turn towards the slab. So the floor around a mirror's rays, and the ceiling above a lamp's, are
@@ -30,7 +30,7 @@
 // P is tried, whose normal is m = c cos alpha - a sin alpha, c the unit vector across the axis to P;
 // and the one across the axis behind the origins.
 //
-// Build-time constants: ARITY (4 or 8); PAPER_BOUNDS for the sphere alone.
+// Build-time constants: ARITY (4 or 8); SPHERES_ALONE leaves them out.
 
 #include "bounds.h"
 #include "common.h"
@@ -138,7 +138,7 @@ inline int16 node_meets_boxes(global const float *rows, const float16 *p)
     return in_reach & (~apart | (cosine <= 0.0f));
 }
 
-#ifdef PAPER_BOUNDS
+#ifdef SPHERES_ALONE
 #define NODE_MEETS(rows, p) node_meets_spheres(rows, p)
 #else
 #define NODE_MEETS(rows, p) (node_meets_boxes(rows, p) & node_meets_slabs(rows, p))

@@ -7,7 +7,7 @@
 //
 // Layouts: nodes in cl/node.h, triangle bounds in cl/geometry.cl, streams in cl/pairs.h.
 // Build-time constants: ARITY, CHUNKS; OBJECTS where objects are tested before their triangles;
-// PAPER_BOUNDS (cl/node.h).
+// SPHERES_ALONE (cl/node.h).
 
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 
@@ -163,7 +163,7 @@ kernel void write_top(const uint num_nodes, const uint first, const uint last,
 
 // --- every level below ---------------------------------------------------------------------------
 
-#ifdef PAPER_BOUNDS
+#ifdef SPHERES_ALONE
 #define NUM_BOUNDS 1 // float4 of a triangle that are needed
 #else
 #define NUM_BOUNDS BOUND_FLOAT4S

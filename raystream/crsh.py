@@ -34,8 +34,8 @@ class CoherentTracer(RayspaceTracer):
         Node levels above the rays; 2 in the paper.
     hash : {"paper", "octahedral"} or None
         What the rays are sorted by (cl/hash.cl); None leaves them in the order of the screen.
-    bound : {"tight", "paper"}
-        How nodes are united (cl/hierarchy.cl, cl/paper_bounds.h).
+    bound : {"tight", "sphere", "paper"}
+        As for `raystream.rsh.RayspaceTracer`.
     cull_meshes : bool
         Test the top level's nodes against bounding spheres of parts of the scene first.
     clusters : int, None or "auto"

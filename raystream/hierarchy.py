@@ -10,7 +10,7 @@ from raystream.rays import Rays, from_numpy
 from raystream.statistics import HIERARCHY_CREATION
 
 ARITIES = (4, 8)
-BOUNDS = ("tight", "paper")
+BOUNDS = ("tight", "sphere", "paper")
 NODE_ROWS = 20  # cl/node.h
 _PER_ITEM = 16  # nodes that one work-item of cl/hierarchy.cl makes
 
@@ -70,8 +70,9 @@ class RayHierarchy:
         order : {"screen", "hash"}
             The leaves follow the screen (`order.screen_slots`), or the order of the rays where
             these have no `size`; or they are sorted by their hash, as `crsh` does by default.
-        bound : {"tight", "paper"}
-            How nodes are united: see cl/hierarchy.cl and cl/paper_bounds.h.
+        bound : {"tight", "sphere", "paper"}
+            How nodes are united: see cl/hierarchy.cl and cl/paper_bounds.h. A traversal tests
+            "tight" nodes against slabs and boxes, too (cl/node.h).
 
         Raises
         ------

@@ -42,9 +42,11 @@ class RayspaceTracer:
         How survivors become the next stream: "fused" writes them straight to their place; the
         others write all children out first and reduce that stream by the method (see
         `stream.reduce`), as the paper does, to show what it costs.
-    bound : {"tight", "paper"}
-        How nodes are united: "paper" as Reis et al. (2017) print it, without the rays' tfar; to
-        reproduce counts (cl/paper_bounds.h).
+    bound : {"sphere", "tight", "paper"}
+        "sphere": triangles are tested by their bounding spheres, as in the paper. "tight": by slabs
+        and boxes, too (cl/node.h), which pays where triangles are large or long. "paper": spheres,
+        and nodes united as Reis et al. (2017) print it, without the rays' tfar; to reproduce
+        counts (cl/paper_bounds.h).
 
     Raises
     ------
@@ -60,7 +62,7 @@ class RayspaceTracer:
         arity=4,
         levels=None,
         reduction=FUSED,
-        bound="tight",
+        bound="sphere",
     ):
         check_choice("arity", arity, ARITIES)
         check_choice("bound", bound, BOUNDS)

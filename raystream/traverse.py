@@ -40,8 +40,8 @@ class Traversal:
         self.session, self.geometry, self.hierarchy = session, geometry, hierarchy
         self._objects = objects
         defines = {} if objects is None else {"OBJECTS": 1}
-        if hierarchy.bound == "paper":
-            defines["PAPER_BOUNDS"] = 1
+        if hierarchy.bound != "tight":
+            defines["SPHERES_ALONE"] = 1
         self._kernels = session.kernels(
             "traverse.cl", ARITY=hierarchy.arity, CHUNKS=CHUNKS, **defines
         )

@@ -15,7 +15,7 @@ FIELDS = ("t", "prim_id", "geom_id", "u", "v")
 OPTIONS = [
     {}, PAPER, {"hash": None}, {"clusters": None}, {"cull_meshes": False}, {"clusters": 16},
     {"arity": 4, "levels": 5}, {"levels": 1}, {"bound": "paper", "levels": 3},
-    {"reduction": "segmented"},
+    {"reduction": "segmented"}, {"bound": "sphere"},
 ]  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from soup import mesh_of, random_rays, triangle_soup
 import raystream as rs
 from raystream import device, rays
 from raystream.errors import MemoryLimitError
+from raystream.hierarchy import BOUNDS
 
 FIELDS = ("t", "prim_id", "geom_id", "u", "v")
 
@@ -32,7 +33,8 @@ def assert_nothing_lost(scene, origins, directions, tfar=np.inf, **options):
 @pytest.mark.parametrize("options", [
     {}, {"reduction": "segmented"}, {"reduction": "scan"}, {"reduction": "horn"},
     {"reduction": "append", "arity": 8}, {"arity": 8}, {"levels": 1}, {"arity": 8, "levels": 2},
-    {"levels": 5},
+    {"levels": 5}, {"bound": "tight"}, {"bound": "tight", "arity": 8, "levels": 2},
+    {"bound": "paper"},
 ])  # fmt: skip
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 64, 65, 1009])
 def test_hits_equal_brute_force(rng, options, count):
@@ -47,8 +49,9 @@ def test_hits_equal_brute_force(rng, options, count):
     st.sampled_from([0.0, 1e-3, 1.0]),  # spread of origins: one point (zero-size nodes) to wide
     st.sampled_from([1e-3, 0.05, 1.0]),  # size of triangles
     st.sampled_from([(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 100.0)]),  # scale, offset
+    st.sampled_from(BOUNDS),
 )
-def test_no_hit_is_ever_lost(seed, angular, spatial, size, place):
+def test_no_hit_is_ever_lost(seed, angular, spatial, size, place, bound):
     rng = np.random.default_rng(seed)
     scale, offset = place
     corners = rng.random((97, 1, 3)) + size * (rng.random((97, 3, 3)) - 0.5)
@@ -60,7 +63,7 @@ def test_no_hit_is_ever_lost(seed, angular, spatial, size, place):
     mixed = np.where(rng.random((130, 1)) < 0.5, aim, towards)
     directions = np.where(mixed.any(axis=1, keepdims=True), mixed, 1.0)
     tfar = np.where(rng.random(130) < 0.5, np.inf, 2 * rng.random(130)).astype(np.float32)
-    assert_nothing_lost(scene, origins, directions, tfar)
+    assert_nothing_lost(scene, origins, directions, tfar, bound=bound)
 
 
 def test_rays_aimed_at_edges_and_vertices_of_a_closed_mesh_hit():
@@ -81,7 +84,7 @@ def test_a_triangle_centred_on_the_axis_is_kept(method):
     """What is left of P across the axis is rounding, whose square is zero."""
     corners = [[[0.9375, 1.0625, 1], [1.0625, 0.9375, 1], [1.03125, 1.03125, 0.9375]]]
     scene = rs.Scene([mesh_of("diagonal", np.array(corners, np.float32))])
-    hits = rs.Tracer(scene, method).intersect(np.zeros((1, 3)), np.ones((1, 3)))
+    hits = rs.Tracer(scene, method, bound="tight").intersect(np.zeros((1, 3)), np.ones((1, 3)))
     assert hits.prim_id[0] == 0 and hits.t[0] == 1
 
 
@@ -96,19 +99,20 @@ def test_voxels_seen_along_their_diagonal(method):
     scene = rs.Scene([mesh_of("sheets", corners.reshape(-1, 3, 3).astype(np.float32))])
     starts = np.stack(np.meshgrid(*[np.arange(0, 3, 0.5)] * 3), axis=-1).reshape(-1, 3) - 0.5
     arguments = starts, np.ones_like(starts)
-    ours, brute = (rs.Tracer(scene, name) for name in (method, "brute"))
+    ours, brute = rs.Tracer(scene, method, bound="tight"), rs.Tracer(scene, "brute")
     assert_same_hits(ours.intersect(*arguments), brute.intersect(*arguments))
     assert ours.statistics.final_hits == brute.statistics.final_hits > 100
 
 
-@pytest.mark.parametrize("method", ["rsh", "crsh"])
-def test_scenes_near_the_limits_of_float(method, rng):
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_scenes_near_the_limits_of_float(bound, rng):
     for exponent in (-18, -12, 12, 18):
         centre = rng.normal(size=3) * 10.0**exponent
         size = 10.0 ** (exponent - 1)
         corners = centre + size * rng.normal(size=(64, 3, 3))
         scene = rs.Scene([mesh_of("far", corners.astype(np.float32))])
-        assert_nothing_lost(scene, np.zeros((64, 3)), corners.mean(axis=1) / np.abs(centre).max())
+        towards = corners.mean(axis=1) / np.abs(centre).max()
+        assert_nothing_lost(scene, np.zeros((64, 3)), towards, bound=bound)
 
 
 def grid_of_rays(width, height):

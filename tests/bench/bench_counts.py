@@ -48,7 +48,7 @@ SCAN_LINES = "rsh scan-lines"
 CONFIGURATIONS = {
     "rsh": ("rsh", _PAPER),
     SCAN_LINES: ("rsh", _PAPER),
-    "rsh tight": ("rsh", _TWO_LEVELS),
+    "rsh tight": ("rsh", {**_TWO_LEVELS, "bound": "tight"}),
     "rsh full": ("rsh", {}),
     "crsh paper": ("crsh", {**_PAPER, "hash": "paper"}),
     "crsh no hash": ("crsh", {"hash": None}),
