@@ -251,7 +251,10 @@ BEYOND = 2**29 + 77  # 32-bit elements: more than 2^31 bytes
 
 def free_memory():
     """Bytes that this process may still take: a container's limit is not in what PoCL reports."""
-    lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+    meminfo = pathlib.Path("/proc/meminfo")
+    if not meminfo.exists():
+        return 0  # not known
+    lines = meminfo.read_text().splitlines()
     free = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
     limit = pathlib.Path("/sys/fs/cgroup/memory.max")
     text = limit.read_text().strip() if limit.exists() else "max"
