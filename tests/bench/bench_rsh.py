@@ -84,7 +84,7 @@ def test_reflections_by_rsh(benchmark, reflections):
 
 
 def test_frame_of_the_demo_scene(benchmark):
-    renderer = rs.Renderer(rs.scenes.demo())
+    renderer = rs.Renderer(rs.scenes.demo(), "rsh")
     renderer.render(size=SIZE)
     benchmark(renderer.render, size=SIZE)
 
@@ -154,7 +154,7 @@ def timed_frame(renderer, camera):
 
 
 def frame_times():
-    renderer = rs.Renderer(rs.scenes.demo())
+    renderer = rs.Renderer(rs.scenes.demo(), "rsh")
     renderer.render(size=SIZE)
     seconds = []
     for _ in range(7):
