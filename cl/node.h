@@ -47,12 +47,17 @@ inline float16 dot16(float16 ax, float16 ay, float16 az, float16 bx, float16 by,
     return FMA16(ax, bx, FMA16(ay, by, az * bz));
 }
 
-// Lane by lane; the arguments are the node's fields in the order of its rows, then P and d.
-inline int16 node_meets_sphere(float16 cx, float16 cy, float16 cz, float16 r, float16 ax, float16 ay,
-                               float16 az, float16 cosine, float16 sine, float16 reach, float16 px,
-                               float16 py, float16 pz, float16 d)
+#define NODE_FIELD(rows, row) ((float16)((rows)[(row) * ARITY]))
+
+// Lane by lane the spheres `p` (x, y, z, d) against the node whose first field is at `rows`.
+inline int16 node_meets_spheres(global const float *rows, const float16 *p)
 {
-    const float16 wx = px - cx, wy = py - cy, wz = pz - cz;
+    const float16 r = NODE_FIELD(rows, 3), d = p[3];
+    const float16 ax = NODE_FIELD(rows, 4), ay = NODE_FIELD(rows, 5), az = NODE_FIELD(rows, 6);
+    const float16 cosine = NODE_FIELD(rows, 7), sine = NODE_FIELD(rows, 8);
+    const float16 reach = NODE_FIELD(rows, 9);
+    const float16 wx = p[0] - NODE_FIELD(rows, 0), wy = p[1] - NODE_FIELD(rows, 1),
+                  wz = p[2] - NODE_FIELD(rows, 2);
     const float16 s
         = FMA16((float16)SLACK, magnitude(wx) + magnitude(wy) + magnitude(wz) + r + d, r + d);
     const float16 h = dot16(wx, wy, wz, ax, ay, az);
@@ -66,17 +71,6 @@ inline int16 node_meets_sphere(float16 cx, float16 cy, float16 cz, float16 r, fl
     const int16 in_cone = (q >= 0.0f) & (p2 <= q * q) & (h >= -s);
     const int16 in_reach = (far >= 0.0f) & (dot16(wx, wy, wz, wx, wy, wz) <= far * far);
     return in_reach & (in_cone | (cosine <= 0.0f));
-}
-
-#define NODE_FIELD(rows, row) ((float16)((rows)[(row) * ARITY]))
-
-// The test of the spheres `p` (x, y, z, d) with the node whose first field is at `rows`.
-inline int16 node_meets_spheres(global const float *rows, const float16 *p)
-{
-    return node_meets_sphere(NODE_FIELD(rows, 0), NODE_FIELD(rows, 1), NODE_FIELD(rows, 2),
-                             NODE_FIELD(rows, 3), NODE_FIELD(rows, 4), NODE_FIELD(rows, 5),
-                             NODE_FIELD(rows, 6), NODE_FIELD(rows, 7), NODE_FIELD(rows, 8),
-                             NODE_FIELD(rows, 9), p[0], p[1], p[2], p[3]);
 }
 
 // Whether origins and ends of the node are not all on one side of the slabs p[4 ..] around p[0 ..].

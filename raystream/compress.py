@@ -12,7 +12,7 @@ import pyopencl.array as cla
 
 from raystream import scan
 from raystream import sort as radix
-from raystream.reduce import SEGMENT_SIZE, Reducer
+from raystream.reduce import Reducer
 from raystream.statistics import COMPRESSION, DECOMPRESSION, SORTING
 
 _CHUNKS_PER_UNIT = 32
@@ -80,9 +80,7 @@ def trim(session, keys, rays, active):
         The first `count` are in use.
     count : Array of shape (1,) uint32
     """
-    trimmed_keys, count = _keep(session, keys, active)
-    trimmed_rays, _ = _keep(session, rays, active)
-    return trimmed_keys, trimmed_rays, count
+    return _keep(session, active, keys, rays)
 
 
 def compress(session, keys, count):
@@ -98,8 +96,7 @@ def compress(session, keys, count):
     n = keys.shape[0]
     heads, positions, sizes = (session.empty(n, t) for t in (np.uint8, np.uint32, np.uint32))
     _launch(session, COMPRESSION, "flag_heads", np.uint64(n), count, keys, heads, positions)
-    chunk_keys, length = _keep(session, keys, heads)
-    bases, _ = _keep(session, positions, heads)
+    chunk_keys, bases, length = _keep(session, heads, keys, positions)
     _launch(session, COMPRESSION, "size_chunks", length, count, bases, sizes)
     return Chunks(chunk_keys, bases, sizes, length)
 
@@ -146,13 +143,13 @@ def decompress(session, chunks, order, rays, count):
     return slots
 
 
-def _keep(session, values, keep):
-    """What is kept of `values`, moved to the left, and its number."""
-    n = values.shape[0]
-    out, total = session.empty(n, np.uint32), session.empty(1, np.uint32)
+def _keep(session, keep, *values):
+    """What is kept of each of `values`, moved to the left, and how many that are."""
+    n = keep.shape[0]
+    kept, total = [session.empty(n, np.uint32) for _ in values], session.empty(1, np.uint32)
     with session.clock.under(COMPRESSION):
-        Reducer(session, 4).reduce("scan", n, values, keep, out, total, SEGMENT_SIZE)
-    return out, total
+        Reducer(session, 4).scan(n, keep, total, *zip(values, kept, strict=True))
+    return *kept, total
 
 
 def _launch(session, stage, kernel, *args):

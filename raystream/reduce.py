@@ -58,16 +58,21 @@ class Reducer:
             sizes = np.uint64(count), np.uint64(segment_size)
             self._launch("concatenate", self._chunks, *sizes, scratch, lengths, self._offsets, out)
         elif method == "scan":
-            n = np.uint64(count)
-            self._launch("count_kept", self._chunks, n, keep, self._offsets)
-            self._launch("scan_counts", 1, self._offsets, total)
-            self._launch("write_kept", self._chunks, n, values, keep, self._offsets, out)
+            self.scan(count, keep, total, (values, out))
         elif method == "horn":
             self._horn(np.uint64(count), values, keep, out, total)
         else:
             self.session.fill(STREAM_REDUCTION, total, 0)
             blocks = -(-count // _APPEND_BLOCK)
             self._launch("append_kept", blocks, np.uint64(count), values, keep, out, total)
+
+    def scan(self, count, keep, total, *pairs):
+        """Reduction "scan" of several (values, out) by the same flags, which are counted once."""
+        n = np.uint64(count)
+        self._launch("count_kept", self._chunks, n, keep, self._offsets)
+        self._launch("scan_counts", 1, self._offsets, total)
+        for values, out in pairs:
+            self._launch("write_kept", self._chunks, n, values, keep, self._offsets, out)
 
     def segments(self, count, values, keep, segments, lengths, segment_size):
         """Each segment reduced alone: survivors of segment s from place s * segment_size on."""

@@ -3,6 +3,9 @@
 import numpy as np
 
 import raystream as rs
+from raystream import device, rays
+
+FIELDS = ("t", "prim_id", "geom_id", "u", "v")
 
 
 def triangle_soup(rng, count, size=0.2):
@@ -29,3 +32,26 @@ def random_rays(rng, count, spread=1.0):
 def exact_tracer(scene, method):
     """A tracer whose hits are exact: `ldc` as published is not."""
     return rs.Tracer(scene, method, **({"exact": True} if method == "ldc" else {}))
+
+
+def grid_of_rays(width, height):
+    """Camera rays of a screen that looks at the unit cube, on the device."""
+    camera = rs.Camera.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.5), fov_y=30.0)
+    return rays.from_camera(device.session(), camera, (width, height))
+
+
+def assert_same_hits(ours, reference):
+    """Every field of the hits is equal, bit for bit."""
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(ours, field), getattr(reference, field), field)
+
+
+def assert_nothing_lost(scene, method, origins, directions, tfar=np.inf, **options):
+    """`method` finds every (ray, triangle) hit that brute force finds: the counts are equal."""
+    tracer, brute = rs.Tracer(scene, method, **options), rs.Tracer(scene, "brute")
+    arguments = (origins, directions, 0.0, tfar)
+    assert_same_hits(tracer.intersect(*arguments), brute.intersect(*arguments))
+    assert tracer.statistics.final_hits == brute.statistics.final_hits
+    blocked = brute.occluded(*arguments)
+    np.testing.assert_array_equal(tracer.occluded(*arguments), blocked)
+    return tracer.statistics

@@ -4,14 +4,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from soup import mesh_of, random_rays, triangle_soup
+from soup import (
+    assert_nothing_lost,
+    grid_of_rays,
+    mesh_of,
+    random_rays,
+    triangle_soup,
+)
 
 import raystream as rs
-from raystream import device, hash, rays, scenes
+from raystream import hash, scenes
 from raystream.statistics import COMPRESSION, DECOMPRESSION, RAY_CREATION, SORTING
 
 PAPER = {"hash": "paper", "bound": "paper", "arity": 8, "levels": 2}
-FIELDS = ("t", "prim_id", "geom_id", "u", "v")
 OPTIONS = [
     {}, PAPER, {"hash": None}, {"clusters": None}, {"cull_meshes": False}, {"clusters": 16},
     {"arity": 4, "levels": 5}, {"levels": 1}, {"bound": "paper", "levels": 3},
@@ -19,30 +24,17 @@ OPTIONS = [
 ]  # fmt: skip
 
 
-def assert_nothing_lost(scene, origins, directions, tfar=np.inf, **options):
-    """Every (ray, triangle) hit that brute force finds is found: the counts are equal."""
-    crsh, brute = rs.Tracer(scene, "crsh", **options), rs.Tracer(scene, "brute")
-    arguments = (origins, directions, 0.0, tfar)
-    ours, theirs = crsh.intersect(*arguments), brute.intersect(*arguments)
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field), field)
-    assert crsh.statistics.final_hits == brute.statistics.final_hits
-    blocked = brute.occluded(*arguments)
-    np.testing.assert_array_equal(crsh.occluded(*arguments), blocked)
-    return crsh.statistics
-
-
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 64, 65, 1009])
 def test_hits_equal_brute_force(rng, options, count):
-    assert_nothing_lost(triangle_soup(rng, 300), *random_rays(rng, count), **options)
+    assert_nothing_lost(triangle_soup(rng, 300), "crsh", *random_rays(rng, count), **options)
 
 
 @pytest.mark.parametrize("triangles", [1, 2, 15, 16, 17, 63, 64, 65, 129])
 @pytest.mark.parametrize("clusters", [None, 16, 64])
 def test_scenes_of_any_size(rng, triangles, clusters):
     scene = triangle_soup(rng, triangles)
-    assert_nothing_lost(scene, *random_rays(rng, 200), clusters=clusters)
+    assert_nothing_lost(scene, "crsh", *random_rays(rng, 200), clusters=clusters)
 
 
 @settings(max_examples=60, deadline=None)
@@ -66,12 +58,7 @@ def test_no_hit_is_ever_lost(seed, angular, spatial, size, place, options):
     mixed = np.where(rng.random((130, 1)) < 0.5, aim, towards)
     directions = np.where(mixed.any(axis=1, keepdims=True), mixed, 1.0)
     tfar = np.where(rng.random(130) < 0.5, np.inf, 2 * rng.random(130)).astype(np.float32)
-    assert_nothing_lost(scene, origins, directions, tfar, **options)
-
-
-def grid_of_rays(width, height):
-    camera = rs.Camera.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.5), fov_y=30.0)
-    return rays.from_camera(device.session(), camera, (width, height))
+    assert_nothing_lost(scene, "crsh", origins, directions, tfar, **options)
 
 
 def test_counts_of_the_paper_tie_up(rng, session):

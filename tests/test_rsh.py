@@ -4,30 +4,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from soup import mesh_of, random_rays, triangle_soup
+from soup import (
+    assert_nothing_lost,
+    assert_same_hits,
+    grid_of_rays,
+    mesh_of,
+    random_rays,
+    triangle_soup,
+)
 
 import raystream as rs
-from raystream import device, rays
 from raystream.errors import MemoryLimitError
 from raystream.hierarchy import BOUNDS
-
-FIELDS = ("t", "prim_id", "geom_id", "u", "v")
-
-
-def assert_same_hits(ours, reference):
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(ours, field), getattr(reference, field), field)
-
-
-def assert_nothing_lost(scene, origins, directions, tfar=np.inf, **options):
-    """`rsh` finds every (ray, triangle) hit that brute force finds: the counts are equal."""
-    rsh, brute = rs.Tracer(scene, "rsh", **options), rs.Tracer(scene, "brute")
-    arguments = (origins, directions, 0.0, tfar)
-    assert_same_hits(rsh.intersect(*arguments), brute.intersect(*arguments))
-    assert rsh.statistics.final_hits == brute.statistics.final_hits
-    blocked = brute.occluded(*arguments)
-    np.testing.assert_array_equal(rsh.occluded(*arguments), blocked)
-    return rsh.statistics
 
 
 @pytest.mark.parametrize("options", [
@@ -39,7 +27,7 @@ def assert_nothing_lost(scene, origins, directions, tfar=np.inf, **options):
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 64, 65, 1009])
 def test_hits_equal_brute_force(rng, options, count):
     scene = triangle_soup(rng, 300)
-    assert_nothing_lost(scene, *random_rays(rng, count), **options)
+    assert_nothing_lost(scene, "rsh", *random_rays(rng, count), **options)
 
 
 @settings(max_examples=80, deadline=None)
@@ -63,7 +51,7 @@ def test_no_hit_is_ever_lost(seed, angular, spatial, size, place, bound):
     mixed = np.where(rng.random((130, 1)) < 0.5, aim, towards)
     directions = np.where(mixed.any(axis=1, keepdims=True), mixed, 1.0)
     tfar = np.where(rng.random(130) < 0.5, np.inf, 2 * rng.random(130)).astype(np.float32)
-    assert_nothing_lost(scene, origins, directions, tfar, bound=bound)
+    assert_nothing_lost(scene, "rsh", origins, directions, tfar, bound=bound)
 
 
 def test_rays_aimed_at_edges_and_vertices_of_a_closed_mesh_hit():
@@ -112,12 +100,7 @@ def test_scenes_near_the_limits_of_float(bound, rng):
         corners = centre + size * rng.normal(size=(64, 3, 3))
         scene = rs.Scene([mesh_of("far", corners.astype(np.float32))])
         towards = corners.mean(axis=1) / np.abs(centre).max()
-        assert_nothing_lost(scene, np.zeros((64, 3)), towards, bound=bound)
-
-
-def grid_of_rays(width, height):
-    camera = rs.Camera.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.5), fov_y=30.0)
-    return rays.from_camera(device.session(), camera, (width, height))
+        assert_nothing_lost(scene, "rsh", np.zeros((64, 3)), towards, bound=bound)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (8, 8), (33, 17), (64, 64)])
@@ -242,14 +225,14 @@ def test_origins_far_apart_lose_nothing(rng):
     scene = triangle_soup(rng, 200, size=0.6)
     origins, directions = random_rays(rng, 200, spread=0.3)
     origins[::16] = [-3e19, 0, 3e19]
-    assert_nothing_lost(scene, origins, directions)
+    assert_nothing_lost(scene, "rsh", origins, directions)
 
 
 def test_a_huge_direction_with_no_length_left():
     corner = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
     scene = rs.Scene([mesh_of("corner", corner)])
     origins, directions = np.zeros((5, 3)), np.full((5, 3), 3e38)
-    assert_nothing_lost(scene, origins, directions, tfar=0.0)
+    assert_nothing_lost(scene, "rsh", origins, directions, tfar=0.0)
 
 
 def test_statistics_are_plain_objects(rng):
