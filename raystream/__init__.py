@@ -8,9 +8,9 @@
 from raystream import scenes, stream
 from raystream._version import __version__
 from raystream.camera import Camera
+from raystream.cube import LayeredDepthCube
 from raystream.device import devices
 from raystream.hierarchy import RayHierarchy
-from raystream.ldc import LayeredDepthCube
 from raystream.light import DirectionalLight, PointLight, SpotLight
 from raystream.material import Material
 from raystream.mesh import Mesh

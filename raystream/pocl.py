@@ -4,13 +4,14 @@ Two faults of the PoCL 3.0 wheel end a process or stop every build; Python canno
 
 * The last step of each compile runs the system's linker (``ld ... -lgcc -lgcc_s -lc``). Where the
   linker or these libraries are missing, PoCL **aborts the process** inside the first launch.
-* The wheel carries LLVM 14, which does not know processors newer than itself (AMD Zen 4 and 5,
-  for one). LLVM then calls the processor ``generic``, a name that PoCL's own compiler refuses:
-  ``error: unknown target CPU 'generic'`` (github.com/pocl/pocl/issues/1049). PoCL offers no
-  setting for it, but keeps the name as a string that it reads at each build: `name_target`
-  replaces that one pointer by the name of the x86-64 level that the processor has. It acts only
-  where PoCL itself says ``generic``, and the child process proves the result before this process
-  relies on it.
+* The wheel carries LLVM 14, which does not know processors newer than itself. It calls AMD's
+  Zen 5 ``generic``, a name that PoCL's own compiler refuses: ``error: unknown target CPU
+  'generic'`` (github.com/pocl/pocl/issues/1049); and Zen 4 ``znver3``, which has no AVX-512, while
+  PoCL links its library for the AVX-512 that it finds: ``LLVM ERROR: Cannot select ... fsqrt``
+  ends the process at the first square root of a float16. PoCL offers no setting for it, but keeps
+  the name as a string that it reads at each build: `name_target` replaces that one pointer by the
+  name of the x86-64 level that the processor has. It acts only on these two names, and the child
+  process proves the result before this process relies on it.
 
 Run as a script (``python pocl.py PLATFORM DEVICE``) this file is the check itself.
 """
@@ -29,6 +30,7 @@ PLATFORM_NAME = "Portable Computing Language"
 _CHECK_SECONDS = 120
 _TRIPLE = b"x86_64-unknown-linux-gnu"
 _UNKNOWN_TARGET = b"generic"
+_TARGET_WITHOUT_AVX512 = b"znver3"
 _STRUCT_BYTES = 1024  # the pointer lies 640 bytes into PoCL 3.0's device structure
 
 # The x86-64 levels of the psABI, best first, with the /proc/cpuinfo flags that each needs.
@@ -59,19 +61,29 @@ def name_target(device):
     bytes or None
         The LLVM target that now stands, None where nothing was changed.
     """
-    if not (is_pocl(device) and device.version.endswith("-generic")):
+    if not is_pocl(device):
         return None
-    address = _target_pointer(device.int_ptr)
-    if address is None:
-        return None
+    said = device.version.rsplit("-", 1)[-1].encode()
     flags = _cpu_flags()
     level = next(name for name, needed in _X86_64_LEVELS if needed <= flags)
+    if not _is_wrong(said, level):
+        return None
+    address = _target_pointer(device.int_ptr, said)
+    if address is None:
+        return None
     ctypes.c_void_p.from_address(address).value = ctypes.addressof(_names[level])
     return level
 
 
-def _target_pointer(structure):
-    """Address of the `llvm_cpu` pointer: it follows the pointer to the target triple."""
+def _is_wrong(target, level):
+    """Whether LLVM's name of a processor of this x86-64 level makes builds fail."""
+    return target == _UNKNOWN_TARGET or (
+        target == _TARGET_WITHOUT_AVX512 and level == _X86_64_LEVELS[0][0]
+    )
+
+
+def _target_pointer(structure, target):
+    """Address of the `llvm_cpu` pointer to `target`: it follows the pointer to the triple."""
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)  # a wrong address is an error, not a crash
     except OSError:
@@ -82,7 +94,7 @@ def _target_pointer(structure):
         for index in range(len(pointers) - 1):
             if (
                 _string_at(memory, pointers[index]) == _TRIPLE
-                and _string_at(memory, pointers[index + 1]) == _UNKNOWN_TARGET
+                and _string_at(memory, pointers[index + 1]) == target
             ):
                 return structure + 8 * (index + 1)
     finally:
@@ -153,7 +165,7 @@ def _check_in_child(device):
         return None
     said = [line.strip() for line in (child.stderr + child.stdout).splitlines() if line.strip()]
     detail = next((line for line in said if "error" in line.lower()), said[-1] if said else "")
-    if "target CPU" in detail:
+    if "target CPU" in detail or "Cannot select" in detail:
         return (
             f"PoCL does not know this processor ({detail}); "
             "install another OpenCL runtime, for instance: pip install intel-opencl-rt"
@@ -172,9 +184,14 @@ def _main(platform, number):
     context = cl.Context([device])
     queue = cl.CommandQueue(context)
     program = cl.Program(
-        context, "kernel void probe(global uint *out) { out[get_global_id(0)] = 42; }"
+        context,
+        # The square root comes from PoCL's library, in vectors as wide as the processor's.
+        "kernel void probe(global uint *out) {"
+        " size_t i = get_global_id(0); float16 x = (float16)(out[i] + 1764);"
+        " out[i] = (uint)sqrt(x).s0; }",
     ).build()
-    out = cl.Buffer(context, cl.mem_flags.READ_WRITE, 4 * 64)
+    zeros = bytearray(4 * 64)
+    out = cl.Buffer(context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=zeros)
     program.probe(queue, (64,), (64,), out)
     result = bytearray(4 * 64)
     cl.enqueue_copy(queue, result, out)

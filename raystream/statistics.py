@@ -36,6 +36,10 @@ class Statistics:
         The largest sum of candidate streams held at one time.
     batches : int
         Number of triangle batches the work was cut into to stay within `memory_limit`.
+    structure_bytes : int
+        What the method has built of the scene, to be kept for a frame (`ldc`: the cube).
+    texels : int
+        Texels of the structure's images (`ldc`).
     stages : dict of str to dict
         Per stage ``device`` seconds (kernels running) and ``wall`` seconds (with launch gaps).
     """
@@ -48,6 +52,8 @@ class Statistics:
     triangles: int = 0
     peak_stream_bytes: int = 0
     batches: int = 0
+    structure_bytes: int = 0
+    texels: int = 0
     stages: dict = dataclasses.field(default_factory=dict)
 
     @property
@@ -55,9 +61,20 @@ class Statistics:
         """Sum of mesh tests, level tests and final tests."""
         return self.mesh_tests + self.final_tests + sum(level["tests"] for level in self.levels)
 
+    @property
+    def bytes_per_triangle(self):
+        """`structure_bytes` for each triangle."""
+        return self.structure_bytes / max(1, self.triangles)
+
+    @property
+    def bytes_per_texel(self):
+        """`structure_bytes` for each texel; 0 where there are none."""
+        return self.structure_bytes / self.texels if self.texels else 0.0
+
     def to_dict(self):
-        """The attributes and `total_tests` as plain Python objects."""
-        return {**dataclasses.asdict(self), "total_tests": self.total_tests}
+        """The attributes and what is derived from them, as plain Python objects."""
+        derived = ("total_tests", "bytes_per_triangle", "bytes_per_texel")
+        return {**dataclasses.asdict(self), **{name: getattr(self, name) for name in derived}}
 
     def add(self, other):
         """Add the counts and times of `other`: the sum over a frame's ray streams.
@@ -66,8 +83,8 @@ class Statistics:
         """
         for name in ("mesh_tests", "final_tests", "final_hits", "rays", "batches"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.triangles = max(self.triangles, other.triangles)
-        self.peak_stream_bytes = max(self.peak_stream_bytes, other.peak_stream_bytes)
+        for name in ("triangles", "peak_stream_bytes", "structure_bytes", "texels"):
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
         missing = len(other.levels) - len(self.levels)
         empty = {"nodes": 0, "tests": 0, "hits": 0, "misses": 0}
         self.levels = [dict(empty) for _ in range(missing)] + self.levels

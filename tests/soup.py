@@ -22,6 +22,14 @@ def mesh_of(name, corners):
     return rs.Mesh(vertices, faces, name=name)
 
 
+def box():
+    """A closed unit cube of twelve triangles."""
+    corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return rs.Scene([rs.Mesh(corners.astype(np.float32), np.array(faces, np.int32), name="box")])
+
+
 def random_rays(rng, count, spread=1.0):
     """Rays that start in a cube around the unit cube, directions of any length."""
     origins = (rng.random((count, 3)) * (1 + 2 * spread) - spread).astype(np.float32)

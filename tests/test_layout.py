@@ -23,7 +23,7 @@ TIERS = (
     {"spd", "rays", "geometry", "scan", "reduce", "sort", "groups"},
     {"scenes", "pairs", "hash", "compress"},
     {"objects", "order", "intersect", "rasterize", "shade", "stream"},
-    {"hierarchy"},
+    {"hierarchy", "cube"},
     {"traverse"},
     {"brute", "rsh", "ldc"},
     {"crsh"},

@@ -1,25 +1,17 @@
-"""The layered depth cube: both builders agree, exact mode loses no hit, published mode is close."""
+"""Method `ldc`: exact mode loses no hit, published mode is close."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_scenes import BUNNY, PATIO
-from soup import mesh_of, random_rays, triangle_soup
+from soup import assert_same_hits, box, mesh_of, random_rays, triangle_soup
 
 import raystream as rs
 from raystream import device, program, scenes
-from raystream.errors import MemoryLimitError
-from raystream.ldc import LayeredDepthCube
+from raystream.cube import LayeredDepthCube
 from raystream.rays import from_camera, from_numpy
 from raystream.statistics import HIERARCHY_CREATION, TRAVERSAL
-
-FIELDS = ("t", "prim_id", "geom_id", "u", "v")
-
-
-def assert_same_hits(ours, theirs):
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field), field)
 
 
 def assert_exact(scene, *arguments, **options):
@@ -31,121 +23,6 @@ def assert_exact(scene, *arguments, **options):
     return ldc.statistics
 
 
-# ---- construction ----
-
-
-@pytest.mark.parametrize("exact", [False, True])
-@pytest.mark.parametrize("resolution", [1, 3, 64, 100])
-def test_both_builders_make_the_same_layers(rng, exact, resolution):
-    scene = triangle_soup(rng, 400, size=0.5)
-    one, many = (
-        LayeredDepthCube.build(scene, resolution, exact=exact, builder=builder)
-        for builder in ("a-buffer", "peeling")
-    )
-    assert one.num_samples == many.num_samples
-    np.testing.assert_array_equal(one.layers, many.layers)
-    for name in ("first", "samples", "blocks"):
-        np.testing.assert_array_equal(getattr(one, name).get(), getattr(many, name).get(), name)
-
-
-def test_texels_of_any_depth_are_sorted(rng):
-    """Hundreds of layers in a texel: nothing is cut off, and heaps sort as insertion does."""
-    heights = rng.permutation(300)[:, None, None] // 3
-    corners = np.concatenate(
-        [np.tile([[[0, 0], [1, 0], [0, 1]]], (300, 1, 1)), np.tile(heights / 300, (1, 3, 1))], 2
-    )
-    scene = rs.Scene([mesh_of("stack", corners.astype(np.float32))])
-    one, many = (
-        LayeredDepthCube.build(scene, 4, exact=True, builder=b) for b in ("a-buffer", "peeling")
-    )
-    np.testing.assert_array_equal(one.layers, [0, 0, 300])
-    samples, first = one.samples.get(), one.first.get()
-    np.testing.assert_array_equal(samples, many.samples.get())
-    for begin, end in zip(first[:-1], first[1:], strict=True):
-        part = samples[begin:end]
-        assert (np.lexsort((part["triangle"], part["near"])) == np.arange(len(part))).all()
-
-
-def test_each_triangle_is_in_the_image_its_normal_looks_along(rng):
-    corners = np.zeros((3, 3, 3), np.float32)
-    for axis in range(3):
-        corners[axis, 1, (axis + 1) % 3] = corners[axis, 2, (axis + 2) % 3] = 1
-        corners[axis, :, axis] = 0.25
-    cube = LayeredDepthCube.build(rs.Scene([mesh_of("three", corners)]), 16)
-    np.testing.assert_array_equal(cube.layers, [1, 1, 1])
-    triangles = cube.samples.get()["triangle"]
-    first = cube.first.get()[:: 16 * 16]
-    for axis in range(3):
-        assert set(triangles[first[axis] : first[axis + 1]]) == {axis}
-
-
-def test_samples_lie_on_their_triangles(rng):
-    """Published mode: the depth at each texel's centre, from a float64 plane."""
-    scene = triangle_soup(rng, 50, size=0.7)
-    resolution = 64
-    cube = LayeredDepthCube.build(scene, resolution)
-    samples, first = cube.samples.get(), cube.first.get().astype(np.int64)
-    assert cube.num_samples == len(samples) == first[-1] > 5000
-    texel = np.repeat(np.arange(3 * resolution**2), np.diff(first))
-    direction, column = texel // resolution**2, texel // resolution % resolution
-    low, per_unit = cube.grid.get()[0, :3], cube.grid.get()[0, 3]
-    corners = (scene.vertices[scene.faces].astype(np.float64) - low) * per_unit
-    a, b, c = np.moveaxis(corners[samples["triangle"]], 1, 0)
-    normal = np.cross(b - a, c - a)
-    rows = np.arange(len(samples))
-    assert (np.abs(normal[rows, direction]) >= 0.999 * np.abs(normal).max(axis=1)).all()
-    point = np.empty((len(samples), 3))
-    point[rows, (direction + 1) % 3] = column + 0.5
-    point[rows, (direction + 2) % 3] = texel % resolution + 0.5
-    point[rows, direction] = samples["near"]
-    off = np.einsum("ij,ij->i", point - a, normal) / np.abs(normal).max(axis=1)
-    assert np.abs(off).max() < 1e-3
-
-
-def test_a_mesh_has_no_holes_and_no_double_samples():
-    """A closed box seen along each axis: two layers in every texel."""
-    cube = LayeredDepthCube.build(box(), 33)
-    counts = np.diff(cube.first.get().astype(np.int64))
-    assert set(counts) == {2}
-
-
-def box():
-    corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return rs.Scene([rs.Mesh(corners.astype(np.float32), np.array(faces, np.int32), name="box")])
-
-
-@pytest.mark.parametrize("exact", [False, True])
-@pytest.mark.parametrize(("resolution", "block"), [(64, 8), (50, 8), (50, 7), (5, 64)])
-def test_blocks_hold_the_depths_of_their_texels(rng, exact, resolution, block):
-    options = {"exact": exact, "block": block}
-    cube = LayeredDepthCube.build(triangle_soup(rng, 60), resolution, **options)
-    samples, first = cube.samples.get(), cube.first.get()
-    blocks = cube.blocks.get()
-    expected = np.full(blocks.shape, [np.inf, -np.inf], np.float32)
-    texel = np.repeat(np.arange(3 * resolution**2), np.diff(first.astype(np.int64)))
-    edge = cube.block
-    index = (
-        texel // resolution**2, texel // resolution % resolution // edge,
-        texel % resolution // edge,
-    )  # fmt: skip
-    np.minimum.at(expected, (*index, 0), samples["near"])
-    np.maximum.at(expected, (*index, 1), samples["far" if exact else "near"])
-    np.testing.assert_array_equal(blocks, expected)
-    if exact:
-        assert (samples["far"] >= samples["near"]).all()
-
-
-def test_an_empty_scene_has_an_empty_cube():
-    vertices = np.zeros((3, 3), np.float32)
-    scene = rs.Scene([rs.Mesh(vertices, np.empty((0, 3), np.int32), name="none")])
-    cube = LayeredDepthCube.build(scene, 8)
-    assert cube.num_samples == 0 and not cube.layers.any() and np.isinf(cube.blocks.get()).all()
-    hits = rs.Tracer(scene, "ldc").intersect([[0, 0, 0]], [[0, 0, 1]])
-    assert hits.prim_id[0] == -1
-
-
 # ---- exact mode ----
 
 
@@ -153,6 +30,7 @@ def test_an_empty_scene_has_an_empty_cube():
 @pytest.mark.parametrize("options", [
     {}, {"resolution": 1}, {"resolution": 37, "block": 5}, {"block": None, "resolution": 64},
     {"builder": "peeling", "resolution": 64}, {"resolution": 64, "block": 1},
+    {"depth": "half"}, {"depth": "half", "resolution": 37, "block": (3, 16)}, {"block": (16, 4)},
 ], ids=str)  # fmt: skip
 def test_hits_equal_brute_force(rng, options, count):
     scene = triangle_soup(rng, 300)
@@ -172,9 +50,10 @@ def moved(scale, offset, values):
     st.sampled_from([(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 100.0), (1e-3, 100.0)]),
     st.sampled_from([0.0, 1.0, 30.0, 3e3, 1e5, 1e7]),  # how far away the rays start
     st.sampled_from([1, 16, 100, 512]),
-    st.sampled_from([8, 3, None]),
+    st.sampled_from([16, 3, (16, 5), (1, 8), None]),
+    st.sampled_from(["full", "half"]),
 )
-def test_no_hit_is_ever_lost(seed, size, shape, place, distance, resolution, block):
+def test_no_hit_is_ever_lost(seed, size, shape, place, distance, resolution, block, depth):
     rng = np.random.default_rng(seed)
     corners = rng.random((97, 1, 3)) + size * (rng.random((97, 3, 3)) - 0.5)
     if shape == "flat":  # parallel to the axes, on lines of the grid and in front of each other
@@ -205,7 +84,8 @@ def test_no_hit_is_ever_lost(seed, size, shape, place, distance, resolution, blo
     directions = (directions * 10.0 ** rng.uniform(-3, 3, (160, 1))).astype(np.float32)
     tnear = np.where(rng.random(160) < 0.7, 0, rng.random(160)).astype(np.float32)
     tfar = np.where(rng.random(160) < 0.5, np.inf, 2 * rng.random(160)).astype(np.float32)
-    assert_exact(scene, origins, directions, tnear, tfar, resolution=resolution, block=block)
+    options = {"resolution": resolution, "block": block, "depth": depth}
+    assert_exact(scene, origins, directions, tnear, tfar, **options)
 
 
 def test_rays_along_the_lines_of_the_grid():
@@ -340,6 +220,30 @@ def test_published_hits_lie_near_their_triangles():
     assert np.linalg.norm(point - on_ray, axis=1).max() < 0.03
 
 
+def test_published_hits_are_shaded_from_the_stored_sample():
+    """u and v are those of a sample: of the middle of a texel in which the triangle has one."""
+    scene, resolution = scenes.mirror_ball((1.0, 2.0, 3.0), 2.0), 100
+    hits, _, _ = sphere_hits(resolution)
+    cube = LayeredDepthCube.build(scene, resolution)
+    texel = np.repeat(np.arange(3 * resolution**2), np.diff(cube.first.get().astype(np.int64)))
+    stored = set(zip(cube.samples.get()["triangle"].tolist(), texel.tolist(), strict=True))
+    inner = (hits.u > 0) & (hits.v > 0) & (hits.u + hits.v < 0.9999)
+    assert inner.sum() > 5000
+    u, v, triangle = hits.u[inner, None], hits.v[inner, None], hits.prim_id[inner]
+    low, per_unit = cube.grid.get()[0, :3], cube.grid.get()[0, 3]
+    a, b, c = np.moveaxis(
+        (scene.vertices[scene.faces[triangle]].astype(np.float64) - low) * per_unit, 1, 0
+    )
+    point = (1 - u - v) * a + u * b + v * c
+    axis = np.abs(np.cross(b - a, c - a)).argmax(axis=1)
+    rows = np.arange(len(point))
+    column, row = point[rows, (axis + 1) % 3], point[rows, (axis + 2) % 3]
+    assert max(np.abs(x % 1 - 0.5).max() for x in (column, row)) < 1e-3
+    texels = axis * resolution**2 + column.astype(int) * resolution + row.astype(int)
+    found = [pair in stored for pair in zip(triangle.tolist(), texels.tolist(), strict=True)]
+    assert np.mean(found) > 0.999  # a ray on a line between texels may be taken for its neighbour's
+
+
 def test_the_tolerance_closes_gaps():
     """Without any, only rays whose depths over a texel enclose a sample's hit it."""
     hits = [np.mean(sphere_hits(256, tolerance=x)[0].prim_id >= 0) for x in (0.0, 1e-3, 1e-2)]
@@ -360,7 +264,7 @@ def test_published_hits_respect_the_segment():
 def test_the_coarse_level_changes_nothing(rng, exact):
     scene, rays = triangle_soup(rng, 500, size=0.1), random_rays(rng, 2000)
     expected = rs.Tracer(scene, "ldc", exact=exact, resolution=128, block=None).intersect(*rays)
-    for block in (8, 16, 11):
+    for block in (8, 16, 11, (5, 24), (24, 5)):
         hits = rs.Tracer(scene, "ldc", exact=exact, resolution=128, block=block).intersect(*rays)
         if exact:
             assert_same_hits(hits, expected)
@@ -419,7 +323,7 @@ def test_the_portable_path_is_the_same(rng, monkeypatch, exact):
     assert second.statistics.final_tests == first.statistics.final_tests
 
 
-# ---- options and memory ----
+# ---- options ----
 
 
 @pytest.mark.parametrize(("options", "message"), [
@@ -431,38 +335,12 @@ def test_the_portable_path_is_the_same(rng, monkeypatch, exact):
     ({"tolerance": "near"}, "tolerance: need"),
     ({"builder": "raster"}, "builder: need one of 'a-buffer', 'peeling', got 'raster'"),
     ({"block": 0}, "block: need a whole number of at least 1, got 0"),
+    ({"block": (8, 0)}, "block: need a whole number of at least 1, got 0"),
+    ({"block": (8, 8, 8)}, "block: need columns and rows, got 3 numbers"),
+    ({"depth": "double"}, "depth: need one of 'full', 'half', got 'double'"),
     ({"layers": 4}, "method 'ldc' has no option 'layers'; its options: resolution, exact"),
 ], ids=str)  # fmt: skip
 def test_options_that_there_are_not(rng, options, message):
     with pytest.raises(ValueError, match=message) as error:
         rs.Tracer(triangle_soup(rng, 10), "ldc", **options)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("exact", [False, True])
-@pytest.mark.parametrize("limit", [2_000_000, 100_000])
-def test_memory_limit(rng, exact, limit):
-    """Refused before the memory is taken; the resolution it names does fit."""
-    scene, rays = triangle_soup(rng, 500, size=0.5), random_rays(rng, 50)
-    ldc = rs.Tracer(scene, "ldc", exact=exact, resolution=512, memory_limit=limit)
-    with pytest.raises(MemoryLimitError, match=f"512 needs .* of memory_limit {limit};") as error:
-        ldc.intersect(*rays)
-    assert "\n" not in str(error.value)
-    fits = int(str(error.value).split()[-2])
-    assert 1 < fits < 512
-    cube = LayeredDepthCube.build(scene, fits, exact=exact, memory_limit=limit)
-    assert 0.4 * limit < cube.nbytes <= limit
-    rs.Tracer(scene, "ldc", exact=exact, resolution=fits, memory_limit=limit).intersect(*rays)
-
-
-def test_no_resolution_fits(rng):
-    with pytest.raises(MemoryLimitError, match="no resolution fits"):
-        LayeredDepthCube.build(triangle_soup(rng, 500), 64, exact=True, memory_limit=100)
-
-
-def test_bytes_are_told(rng):
-    cube = LayeredDepthCube.build(triangle_soup(rng, 500), 64, exact=True)
-    arrays = (cube.samples, cube.first, cube.blocks, cube.slabs)
-    assert cube.nbytes == sum(array.nbytes for array in arrays)
-    assert cube.bytes_per_triangle == cube.nbytes / 500
-    assert cube.bytes_per_texel == cube.nbytes / (3 * 64 * 64)

@@ -44,8 +44,11 @@ def test_an_abort_for_want_of_a_linker_says_what_to_install(cpu, fresh_cache, mo
     assert not fresh_cache.exists()
 
 
-def test_an_unknown_processor_says_what_to_install(cpu, fresh_cache, monkeypatch):
-    child(monkeypatch, 1, "error: unknown target CPU 'generic'")
+@pytest.mark.parametrize(
+    "said", ["error: unknown target CPU 'generic'", "LLVM ERROR: Cannot select: 0x7f: i64 = fsqrt"]
+)
+def test_an_unknown_processor_says_what_to_install(cpu, fresh_cache, monkeypatch, said):
+    child(monkeypatch, 1, said)
     assert "intel-opencl-rt" in pocl.failure(cpu)
 
 
@@ -67,7 +70,7 @@ def test_a_structure_without_the_two_strings_is_left_alone():
     import ctypes
 
     block = ctypes.create_string_buffer(4096)
-    assert pocl._target_pointer(ctypes.addressof(block)) is None
+    assert pocl._target_pointer(ctypes.addressof(block), b"generic") is None
 
 
 def test_the_pointer_is_found_behind_the_triple():
@@ -77,4 +80,19 @@ def test_the_pointer_is_found_behind_the_triple():
     name = ctypes.create_string_buffer(b"generic")
     block = (ctypes.c_uint64 * 256)()
     block[80], block[81] = ctypes.addressof(triple), ctypes.addressof(name)
-    assert pocl._target_pointer(ctypes.addressof(block)) == ctypes.addressof(block) + 81 * 8
+    address = ctypes.addressof(block)
+    assert pocl._target_pointer(address, b"generic") == address + 81 * 8
+    assert pocl._target_pointer(address, b"znver3") is None
+
+
+@pytest.mark.parametrize(
+    ("target", "level", "wrong"),
+    [
+        (b"generic", b"x86-64-v2", True),
+        (b"znver3", b"x86-64-v4", True),  # Zen 4: LLVM's name leaves out the AVX-512 it has
+        (b"znver3", b"x86-64-v3", False),
+        (b"icelake-server", b"x86-64-v4", False),
+    ],
+)
+def test_names_that_make_builds_fail(target, level, wrong):
+    assert pocl._is_wrong(target, level) is wrong

@@ -12,25 +12,83 @@
 // are at most three, so: every point of a triangle is within 17 u resolution of a texel, and of a
 // depth, that conservative rasterisation gives it. The ray's slack (ldc.cl) pays for that.
 //
-// Build-time constant: CONSERVATIVE, where defined, samples hold the interval of depths in the
+// A sample is a depth and a triangle, in arrays of their own: `near`, `triangle`, and `far` where
+// CONSERVATIVE. Everything else that it holds, the point, normal, colour, geom_id and prim_id, follows
+// from its texel, depth and triangle (a visibility buffer: Burns, Hunt 2013), and is computed for
+// the few that are asked for. Depths are read sixteen at a time: both arrays have DEPTH_PADDING
+// more elements.
+//
+// Build-time constants: CONSERVATIVE, where defined, samples hold the interval of depths in the
 // texel, of all triangles that touch it; otherwise the depth at the texel's centre, of those that
-// cover that.
+// cover that. HALF_DEPTH, where defined: depths of 16 bits, 11 of them significant, rounded
+// outwards where CONSERVATIVE.
 
 #include "triangle.h"
 
-typedef struct {
-    float near;
-#ifdef CONSERVATIVE
-    float far;
+#ifdef HALF_DEPTH
+
+// The bits of a half are those of the float 2^-112 times as large, without the last 13. Depths are
+// neither negative nor above MAX_RESOLUTION of cube.py. (Half arithmetic and its built-ins are
+// optional in OpenCL 1.2.)
+typedef ushort Depth;
+typedef ushort16 Depth16;
+#define BITS_LESS 13
+#define HALF_SCALE 0x1p-112f
+inline Depth depth_below(float z) { return (ushort)(as_uint(z * HALF_SCALE) >> BITS_LESS); }
+inline Depth depth_above(float z)
+{
+    return (ushort)((as_uint(z * HALF_SCALE) + (1u << BITS_LESS) - 1) >> BITS_LESS);
+}
+inline Depth depth_nearest(float z)
+{
+    return (ushort)((as_uint(z * HALF_SCALE) + (1u << (BITS_LESS - 1))) >> BITS_LESS);
+}
+inline float depth_of(Depth d) { return as_float((uint)d << BITS_LESS) * (1.0f / HALF_SCALE); }
+inline float16 depths_of(Depth16 d)
+{
+    return as_float16(CONVERT(uint16, d) << BITS_LESS) * (1.0f / HALF_SCALE);
+}
+
+#else
+
+typedef float Depth;
+typedef float16 Depth16;
+inline Depth depth_below(float z) { return z; }
+inline Depth depth_above(float z) { return z; }
+inline Depth depth_nearest(float z) { return z; }
+inline float depth_of(Depth d) { return d; }
+inline float16 depths_of(Depth16 d) { return d; }
+
 #endif
-    uint triangle;
-} Sample;
+
+// Of the published mode `far` is not read: a sample's depths are the one it has.
+typedef struct {
+    global Depth *near, *far;
+    global uint *triangle;
+} Samples;
+
+inline void write_sample(const Samples *s, ulong place, uint triangle, float near, float far)
+{
+#ifdef CONSERVATIVE
+    s->near[place] = depth_below(near);
+    s->far[place] = depth_above(far);
+#else
+    s->near[place] = depth_nearest(near);
+#endif
+    s->triangle[place] = triangle;
+}
 
 #ifdef CONSERVATIVE
-#define FAR(sample) ((sample).far)
+#define FAR(samples) ((samples)->far)
 #else
-#define FAR(sample) ((sample).near)
+#define FAR(samples) ((samples)->near)
 #endif
+
+// A sample on its way into its place.
+typedef struct {
+    float near, far;
+    uint triangle;
+} Fragment;
 
 // grid[0]: low corner, texels per unit; grid[1]: the box's diagonal and a texel's edge.
 typedef struct {
@@ -73,26 +131,18 @@ inline int cell_of(float v, int cells)
 
 enum { COUNT, SCATTER, PEEL };
 
-// COUNT: `counts` grows. SCATTER: a sample is written to any free place of its texel, and `counts`
-// shrinks. PEEL: the nearest sample of a texel behind that of the layer before goes into `next`,
-// and the one in `last`, which is that layer's, becomes sample `layer` of its texel.
+// COUNT: `counts` grows. SCATTER: a fragment is written to any free place of its texel, and
+// `counts` shrinks. PEEL: the nearest fragment of a texel behind that of the layer before goes into
+// `next`, and the one in `last`, which is that layer's, becomes sample `layer` of its texel.
 typedef struct {
     global uint *counts;
     global const uint *first;
-    global Sample *samples;
+    global Fragment *fragments;
+    Samples samples;
     global const ulong *last;
     global ulong *next;
     uint layer;
 } Sink;
-
-inline void write_sample(global Sample *sample, uint triangle, float near, float far)
-{
-    sample->near = near;
-#ifdef CONSERVATIVE
-    sample->far = far;
-#endif
-    sample->triangle = triangle;
-}
 
 // Rounding may leave the cube by less than the slack: depths are not negative, so that their bits
 // sort like them.
@@ -105,14 +155,15 @@ inline void emit(const uint mode, const Sink *sink, uint texel, uint triangle, f
         atomic_inc(sink->counts + texel);
     } else if (mode == SCATTER) {
         const uint place = atomic_dec(sink->counts + texel) - 1;
-        write_sample(sink->samples + sink->first[texel] + place, triangle, near, far);
+        const Fragment fragment = {near, far, triangle};
+        sink->fragments[sink->first[texel] + place] = fragment;
     } else {
         const ulong key = hit_key(near, triangle);
         const bool beyond = sink->layer == 0 || key > sink->last[texel];
         if (beyond)
             atom_min(sink->next + texel, key);
         else if (key == sink->last[texel])
-            write_sample(sink->samples + sink->first[texel] + sink->layer - 1, triangle, near, far);
+            write_sample(&sink->samples, sink->first[texel] + sink->layer - 1, triangle, near, far);
     }
 }
 
@@ -130,6 +181,13 @@ inline Interval include(Interval i, float v)
 {
     i.low = v < i.low ? v : i.low;
     i.high = v > i.high ? v : i.high;
+    return i;
+}
+
+// Around two intervals; empty ones, with low > high, count for nothing.
+inline Interval both(Interval a, Interval b)
+{
+    const Interval i = {MIN(a.low, b.low), MAX(a.high, b.high)};
     return i;
 }
 
@@ -176,7 +234,7 @@ inline void fill_column(const uint mode, const Sink *sink, uint texel, int resol
         Interval z = end;
         if (row < last) {
             end = cross_depths(p, n, (float)(row + 1));
-            z = include(include(z, end.low), end.high);
+            z = both(z, end);
         }
         for (uint k = 0; k < n; k++)
             if (p[k].y >= (float)row && p[k].y <= (float)(row + 1))
@@ -252,16 +310,54 @@ inline void fill(const uint mode, const Sink *sink, uint plane, int resolution, 
 
 #endif
 
-// Into the image of the axis that the normal is most parallel to. Zero area: along any of them.
+// The axis that the normal is most parallel to. Zero area: any of them.
+inline uint axis_of(float4 normal)
+{
+    const float x = size_of(normal.x), y = size_of(normal.y), z = size_of(normal.z);
+    return x >= y && x >= z ? 0 : y >= z ? 1 : 2;
+}
+
+inline float4 grid_normal(const Grid *grid, global const float4 *corners)
+{
+    const float4 a = to_grid(grid, corners[0]);
+    return cross3(to_grid(grid, corners[1]) - a, to_grid(grid, corners[2]) - a);
+}
+
+// Into the image of that axis.
 inline void rasterise(const uint mode, const Sink *sink, const Grid *grid, int resolution,
                       global const float4 *triangles, uint triangle)
 {
     global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)triangle;
     float4 p[3] = {to_grid(grid, v[0]), to_grid(grid, v[1]), to_grid(grid, v[2])};
-    const float4 normal = cross3(p[1] - p[0], p[2] - p[0]);
-    const float x = size_of(normal.x), y = size_of(normal.y), z = size_of(normal.z);
-    const uint axis = x >= y && x >= z ? 0 : y >= z ? 1 : 2;
+    const uint axis = axis_of(cross3(p[1] - p[0], p[2] - p[0]));
     for (uint k = 0; k < 3; k++)
         p[k] = seen_along(axis, p[k]);
     fill(mode, sink, axis * (uint)resolution * resolution, resolution, triangle, p);
+}
+
+// Weights u, v of the point of a triangle seen at the middle of a texel in the image of its
+// direction; of the nearest point within its outline where that is beside it.
+inline float2 weights_at(const Grid *grid, global const float4 *corners, int column, int row)
+{
+    const float4 a = to_grid(grid, corners[0]);
+    const float4 b = to_grid(grid, corners[1]) - a, c = to_grid(grid, corners[2]) - a;
+    const uint axis = axis_of(cross3(b, c));
+    const float4 o = seen_along(axis, a), e = seen_along(axis, b), f = seen_along(axis, c);
+    const float x = (float)column + 0.5f - o.x, y = (float)row + 0.5f - o.y;
+    const float area = e.x * f.y - e.y * f.x;
+    float2 weights = (float2)(x * f.y - y * f.x, e.x * y - e.y * x) / area;
+    weights = weights > 0.0f ? weights : 0.0f; // NaN of a zero area becomes 0
+    weights = weights < 0x1p60f ? weights : 0x1p60f; // infinity would become NaN
+    const float sum = weights.x + weights.y;
+    return sum > 1.0f ? weights / sum : weights;
+}
+
+// ---- the coarse level ----
+
+#define SLABS 64 // that the cube's depth is cut into
+
+inline ulong slabs_between(float near, float far, float per_slab)
+{
+    const int first = cell_of(near * per_slab, SLABS), last = cell_of(far * per_slab, SLABS);
+    return (2ul << last) - (1ul << first);
 }
