@@ -3,9 +3,10 @@
 // Traversal (section 1.4): one direction after another, that of the ray's largest component first;
 // in each, the blocks in the ray's columns, nearest first; where the slabs of depth that the ray
 // passes over a block are occupied, its texels likewise; the ray ends at the nearest hit so far.
-// Nothing is stepped: each column's piece of the ray is computed from the ray itself, sixteen
-// columns at a time, so errors do not add up; cells are widened by the ray's slack. The layers of a
-// texel are compared sixteen at a time.
+// Nothing is stepped: each column's piece of the ray is computed from the ray itself, so errors do
+// not add up; cells are widened by the ray's slack. Sixteen at a time (the paper's section 4 names
+// four): rays over the blocks, each over a column of its own; columns of texels in a block, of one
+// ray; the layers of a texel.
 //
 // Published mode: a hit is a sample within the tolerance of the ray's depths over its texel; the
 // samples of the surface that a ray starts or ends on are no hits (`touches`).
@@ -23,7 +24,7 @@
 // Coordinates should lie between about 1e-15 and 1e15, as the test itself needs it. Rays whose
 // slack exceeds a quarter of the cube, from 16,000 cubes away, are tested against all triangles.
 //
-// Build-time constants: RAYS, rays to a work-item; those of cube.h.
+// Build-time constants: RAYS, rays to a work-item, a multiple of 16; those of cube.h.
 
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 #pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
@@ -38,34 +39,41 @@ typedef struct {
     float low, high;
 } Span;
 
-// Cells of texels in an image, main by side texels each: cell (i, j) is number first + i *
-// main_stride + j * side_stride.
-typedef struct {
-    uint first, main_stride, side_stride;
-    int main, side;
-} Image;
-
 // A ray in grid space, o + s d with the largest component of d 1 in size, as one direction sees it:
-// the faster coordinate of its image (main), the slower one (side), and depth. `inverse` is 0 where
-// the ray stands still.
-typedef struct {
-    float main_o, main_d, main_inverse;
-    float side_o, side_d, side_inverse;
-    float depth_o, depth_d, depth_inverse;
-    Image texels, blocks;
-} GridRay;
+// the faster coordinate of its image (main), the slower one (side), and depth. And the cells there,
+// of main by side texels: cell (i, j) is number first + i * main_stride + j * side_stride. `inverse`
+// is 0 where the ray stands still. Of one ray, or of sixteen.
+#define DEFINE_GRID_RAY(NAME, F, I)                                                                \
+    typedef struct {                                                                               \
+        F main_o, main_d, main_inverse, side_o, side_d, side_inverse, depth_o, depth_d,            \
+            depth_inverse, slack, tolerance;                                                       \
+        I first, main_stride, side_stride, main, side;                                             \
+    } NAME;
 
-// The cube, and what is known of one ray.
+DEFINE_GRID_RAY(GridRay, float, int)
+DEFINE_GRID_RAY(GridRay16, float16, int16)
+
+// The cube.
 typedef struct {
     int resolution;
-    float slack, tolerance, per_slab; // the tolerance includes the slack
+    int2 block;
+    float per_slab;
     global const uint *first;
     Samples samples;
     global const ulong *slabs;
     global const float4 *triangles;
-    RayFrame frame;
+    uint num_triangles;
+} Cube;
+
+// What is known of one ray.
+typedef struct {
+    const Cube *cube;
+    float slack, tolerance; // the tolerance includes the slack
+    float o[3], d[3], inverse[3]; // in grid space
+    uint order[3]; // of the directions
+    float begin, end; // in s
     float per_t; // s = per_t * t
-    float end;   // of the ray, in s
+    RayFrame frame;
     ulong nearest;
     uint tested[MAILBOX];
     uint tests, hits;
@@ -116,7 +124,7 @@ inline void test_triangle(Trace *t, uint triangle)
 {
     t->tests++;
     const TriangleHit h
-        = intersect_triangle(&t->frame, t->triangles + TRIANGLE_FLOAT4S * (ulong)triangle);
+        = intersect_triangle(&t->frame, t->cube->triangles + TRIANGLE_FLOAT4S * (ulong)triangle);
     if (!h.hit)
         return;
     t->hits++;
@@ -133,7 +141,7 @@ inline bool done(const Trace *t) { return t->any && t->nearest != MISS; }
 // texel. All rays from a surface, and from a light to it, would be caught by its own samples.
 inline bool touches(const Trace *t, uint triangle)
 {
-    global const float4 *v = t->triangles + TRIANGLE_FLOAT4S * (ulong)triangle;
+    global const float4 *v = t->cube->triangles + TRIANGLE_FLOAT4S * (ulong)triangle;
     const float4 a = v[0], ab = v[1] - a, ac = v[2] - a;
     const float4 m = MAX(size_of4(ab), size_of4(ac));
     const float scale = MAX(m.x, MAX(m.y, m.z));
@@ -147,7 +155,7 @@ inline bool touches(const Trace *t, uint triangle)
 
 inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
 {
-    const uint triangle = t->samples.triangle[k];
+    const uint triangle = t->cube->samples.triangle[k];
     if (!was_tested(t, triangle))
         test_triangle(t, triangle);
 }
@@ -157,10 +165,10 @@ inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
 // Where the ray has the sample's depth, within the texel.
 inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
 {
-    const uint triangle = t->samples.triangle[k];
+    const uint triangle = t->cube->samples.triangle[k];
     float at = s.low;
     if (r->depth_d != 0.0f)
-        at = (depth_of(t->samples.near[k]) - r->depth_o) * r->depth_inverse;
+        at = (depth_of(t->cube->samples.near[k]) - r->depth_o) * r->depth_inverse;
     at = at < s.low ? s.low : at > s.high ? s.high : at;
     float distance = at / t->per_t;
     distance = MAX(distance, t->frame.tnear);
@@ -179,8 +187,8 @@ inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
 // The samples from `begin` on whose depths meet `z`, a bit each, of sixteen.
 inline uint meeting_samples(const Trace *t, uint begin, uint end, Span z)
 {
-    const float16 near = depths_of(LOAD_UNALIGNED(Depth16, t->samples.near + begin));
-    const float16 far = depths_of(LOAD_UNALIGNED(Depth16, FAR(&t->samples) + begin));
+    const float16 near = depths_of(LOAD_UNALIGNED(Depth16, t->cube->samples.near + begin));
+    const float16 far = depths_of(LOAD_UNALIGNED(Depth16, FAR(&t->cube->samples) + begin));
     const uint left = end - begin, meant = left < 16 ? (1u << left) - 1 : 0xffffu;
     return MASK16((near <= z.high) & (far >= z.low)) & meant;
 }
@@ -191,22 +199,27 @@ typedef struct {
     int first, step, count;
 } Cells;
 
-inline Cells cells_over(Span v, float d, float per_cell, int least, int most)
+inline Cells cells_over(const GridRay *r, Span s, int least, int most)
 {
+    const Span v = values(s, r->main_o, r->main_d, r->slack);
+    const float per_cell = 1.0f / (float)r->main;
     int a = floor_of(v.low * per_cell), b = floor_of(v.high * per_cell);
     a = a < least ? least : a;
     b = b > most ? most : b;
     const Cells up = {a, 1, b - a + 1}, down = {b, -1, b - a + 1};
-    return d < 0.0f ? down : up;
+    return r->main_d < 0.0f ? down : up;
 }
 
-// Of sixteen columns of cells in a row: the column, the ray's piece over it, the depths and the
-// first and last row of cells there, and whether the ray passes it, as a bit of `mask`.
+// Of sixteen columns of cells: the ray's piece over it, the depths and the first and last row of
+// cells there, and whether the ray passes it, as a bit of `mask`.
 typedef struct {
     float16 enter, leave, near, far;
     int16 column, low, high;
     uint mask;
 } Columns;
+
+#define LANE(v, k) (((float *)&(v))[k])
+#define WHOLE_LANE(v, k) (((int *)&(v))[k])
 
 inline int16 floor_of16(float16 v)
 {
@@ -214,147 +227,216 @@ inline int16 floor_of16(float16 v)
     return whole + (v < CONVERT(float16, whole)); // truth is -1
 }
 
-// The cells' columns from number `before` on, over the span `s`; rows bottom .. top.
-inline Columns cut_columns(const Trace *t, const GridRay *r, const Image *image, Span s,
-                           Cells cells, int before, int bottom, int top)
-{
-    const int16 lanes = (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    const float size = (float)image->main, per_row = 1.0f / (float)image->side;
-    Columns c;
-    c.column = cells.first + cells.step * (before + lanes);
-    float16 enter = s.low, leave = s.high;
-    if (r->main_d != 0.0f) {
-        const float16 column = CONVERT(float16, c.column);
-        const float16 low = column * size - t->slack, high = column * size + (size + t->slack);
-        const float16 a = (low - r->main_o) * r->main_inverse;
-        const float16 b = (high - r->main_o) * r->main_inverse;
-        const float16 in = a < b ? a : b, out = a < b ? b : a;
-        enter = in > enter ? in : enter;
-        leave = out < leave ? out : leave;
-    }
-    const float16 ya = r->side_o + enter * r->side_d, yb = r->side_o + leave * r->side_d;
-    const float16 za = r->depth_o + enter * r->depth_d, zb = r->depth_o + leave * r->depth_d;
-    const int16 low = floor_of16(((ya < yb ? ya : yb) - t->slack) * per_row);
-    const int16 high = floor_of16(((ya < yb ? yb : ya) + t->slack) * per_row);
-    c.low = low < bottom ? (int16)bottom : low;
-    c.high = high > top ? (int16)top : high;
-    c.enter = enter;
-    c.leave = leave;
-    c.near = (za < zb ? za : zb) - t->tolerance;
-    c.far = (za < zb ? zb : za) + t->tolerance;
-    const int left = cells.count - before;
-    const uint meant = left < 16 ? (1u << left) - 1 : 0xffffu;
-    c.mask = MASK16((enter <= leave) & (c.low <= c.high)) & meant;
-    return c;
-}
-
-// Runs the last argument for the columns of the image's cells that the ray passes over the span
-// `s`, nearest first, among the columns left .. right and rows bottom .. top, until the ray ends:
-// lane `k` of `c`, whose mask FILTER may have thinned out, and `p`, the ray's piece over the column.
-#define WALK(IMAGE, S, LEFT, RIGHT, BOTTOM, TOP, FILTER, ...)                                      \
+// Columns of one ray, or one of each of sixteen, over the span begin .. end; rows bottom .. top.
+#define DEFINE_CUT_COLUMNS(SUFFIX, RAY)                                                            \
+    inline Columns cut_columns##SUFFIX(const RAY *r, int16 column, float16 begin, float16 end,     \
+                                       int16 bottom, int16 top)                                    \
     {                                                                                              \
-        const float per_cell = 1.0f / (float)(IMAGE)->main;                                        \
-        const Span over = values(S, r->main_o, r->main_d, t->slack);                               \
-        const Cells cells = cells_over(over, r->main_d, per_cell, LEFT, RIGHT);                    \
-        for (int before = 0; before < cells.count; before += 16) {                                 \
-            const Span rest = {(S).low, MIN((S).high, t->end)};                                    \
-            Columns c = cut_columns(t, r, IMAGE, rest, cells, before, BOTTOM, TOP);                \
-            FILTER for (uint mask = c.mask; mask != 0; mask &= mask - 1)                           \
-            {                                                                                      \
-                const uint k = LOWEST(mask);                                                       \
-                const Span p = {LANE(c.enter, k), MIN(LANE(c.leave, k), t->end)};                  \
-                if (p.low > p.high)                                                                \
-                    continue;                                                                      \
-                __VA_ARGS__                                                                        \
-                if (done(t))                                                                       \
-                    return;                                                                        \
-            }                                                                                      \
-        }                                                                                          \
+        Columns c;                                                                                 \
+        const float16 size = CONVERT(float16, (int16)(r->main)), slack = (float16)(r->slack);      \
+        const float16 from = CONVERT(float16, column) * size - slack;                              \
+        const float16 to = CONVERT(float16, column) * size + (size + slack);                       \
+        const float16 a = (from - (float16)(r->main_o)) * (float16)(r->main_inverse);              \
+        const float16 b = (to - (float16)(r->main_o)) * (float16)(r->main_inverse);                \
+        const float16 in = a < b ? a : b, out = a < b ? b : a;                                     \
+        const int16 moves = (float16)(r->main_d) != 0.0f;                                          \
+        c.enter = (moves & (in > begin)) ? in : begin;                                             \
+        c.leave = (moves & (out < end)) ? out : end;                                               \
+        const float16 side_o = (float16)(r->side_o), side_d = (float16)(r->side_d);                \
+        const float16 ya = side_o + c.enter * side_d, yb = side_o + c.leave * side_d;              \
+        const float16 depth_o = (float16)(r->depth_o), depth_d = (float16)(r->depth_d);            \
+        const float16 za = depth_o + c.enter * depth_d, zb = depth_o + c.leave * depth_d;          \
+        const float16 per_row = 1.0f / CONVERT(float16, (int16)(r->side));                         \
+        const int16 low = floor_of16(((ya < yb ? ya : yb) - slack) * per_row);                     \
+        const int16 high = floor_of16(((ya < yb ? yb : ya) + slack) * per_row);                    \
+        c.column = column;                                                                         \
+        c.low = low < bottom ? bottom : low;                                                       \
+        c.high = high > top ? top : high;                                                          \
+        c.near = (za < zb ? za : zb) - (float16)(r->tolerance);                                    \
+        c.far = (za < zb ? zb : za) + (float16)(r->tolerance);                                     \
+        c.mask = MASK16((c.enter <= c.leave) & (c.low <= c.high));                                 \
+        return c;                                                                                  \
     }
 
-#define LANE(v, k) (((const float *)&(v))[k])
-#define WHOLE_LANE(v, k) (((const int *)&(v))[k])
+DEFINE_CUT_COLUMNS(, GridRay)
+DEFINE_CUT_COLUMNS(16, GridRay16)
 
-// The piece of a column's piece over one row.
-inline Span row_piece(const Trace *t, const GridRay *r, Span s, int row, int size)
+// ---- one ray over the texels of a block ----
+
+// The piece of a column's piece over one row of cells.
+inline Span row_piece(const GridRay *r, Span s, int row, int size)
 {
-    return piece(s, r->side_o, r->side_d, r->side_inverse, (float)(row * size) - t->slack,
-                 (float)((row + 1) * size) + t->slack);
+    return piece(s, r->side_o, r->side_d, r->side_inverse, (float)(row * size) - r->slack,
+                 (float)((row + 1) * size) + r->slack);
 }
 
 // The samples of a texel: those that the column's depths meet are few, and looked at again over the
 // texel alone.
 inline void visit_texel(Trace *t, const GridRay *r, uint texel, int row, Span column, Span p)
 {
-    const uint end = t->first[texel + 1];
-    for (uint begin = t->first[texel]; begin < end; begin += 16) {
+    const uint end = t->cube->first[texel + 1];
+    for (uint begin = t->cube->first[texel]; begin < end; begin += 16) {
         if (meeting_samples(t, begin, end, column) == 0)
             continue;
-        const Span q = row_piece(t, r, p, row, 1);
+        const Span q = row_piece(r, p, row, 1);
         if (q.low > q.high)
             return;
-        const Span z = values(q, r->depth_o, r->depth_d, t->tolerance);
+        const Span z = values(q, r->depth_o, r->depth_d, r->tolerance);
         for (uint m = meeting_samples(t, begin, end, z); m != 0 && !done(t); m &= m - 1)
             visit_sample(t, r, begin + LOWEST(m), q);
     }
 }
 
-// The texels of a block that starts at texel (left, bottom).
-inline void walk_block(Trace *t, const GridRay *r, Span s, int left, int bottom)
+// Of the block that starts at texel (left, bottom), `size` texels each way.
+inline void walk_texels(Trace *t, const GridRay *r, Span s, int left, int bottom, int2 size)
 {
-    const int right = MIN(left + r->blocks.main, t->resolution) - 1;
-    const int top = MIN(bottom + r->blocks.side, t->resolution) - 1;
-    WALK(&r->texels, s, left, right, bottom, top, , {
-        const Span column = {LANE(c.near, k), LANE(c.far, k)};
-        const uint line = r->texels.first + WHOLE_LANE(c.column, k) * r->texels.main_stride;
-        for (int row = WHOLE_LANE(c.low, k); row <= WHOLE_LANE(c.high, k); row++)
-            visit_texel(t, r, line + row * r->texels.side_stride, row, column, p);
-    })
+    const int16 lanes = (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const int right = MIN(left + size.x, t->cube->resolution) - 1;
+    const int top = MIN(bottom + size.y, t->cube->resolution) - 1;
+    const Cells cells = cells_over(r, s, left, right);
+    for (int before = 0; before < cells.count; before += 16) {
+        Columns c = cut_columns(r, cells.first + cells.step * (before + lanes), s.low,
+                                MIN(s.high, t->end), bottom, top);
+        const int rest = cells.count - before;
+        c.mask &= rest < 16 ? (1u << rest) - 1 : 0xffffu;
+        for (; c.mask != 0; c.mask &= c.mask - 1) {
+            const uint k = LOWEST(c.mask);
+            const Span p = {LANE(c.enter, k), MIN(LANE(c.leave, k), t->end)};
+            if (p.low > p.high)
+                continue;
+            const Span depths = {LANE(c.near, k), LANE(c.far, k)};
+            const uint line = r->first + WHOLE_LANE(c.column, k) * r->main_stride;
+            for (int row = WHOLE_LANE(c.low, k); row <= WHOLE_LANE(c.high, k); row++)
+                visit_texel(t, r, line + row * r->side_stride, row, depths, p);
+            if (done(t))
+                return;
+        }
+    }
 }
 
-// The slabs of depth over each column, and the columns in which they are occupied. Most columns
-// have one or two rows, which are looked up without a branch; more, where blocks are narrow or the
-// slack is large, are left to the walk.
-inline uint occupied_columns(const Trace *t, const Image *image, const Columns *c, ulong *slabs)
+// ---- sixteen rays over the blocks of a direction ----
+
+// The ray as direction `axis` sees it, over cells of n columns by m rows of texels.
+inline GridRay seen_ray(const Trace *t, uint axis, int n, int m)
 {
-    const int16 last_slab = SLABS - 1;
-    int16 a = CONVERT(int16, c->near * t->per_slab), b = CONVERT(int16, c->far * t->per_slab);
-    a = a < 0 ? 0 : a > last_slab ? last_slab : a;
-    b = b < 0 ? 0 : b > last_slab ? last_slab : b;
+    const uint column = axis == 2 ? 0 : axis + 1, row = axis == 0 ? 2 : axis - 1;
+    const bool turn = size_of(t->d[row]) > size_of(t->d[column]);
+    const uint main = turn ? row : column, side = turn ? column : row;
+    const int last = t->cube->resolution - 1, across = last / n + 1, along = last / m + 1;
+    const GridRay r = {t->o[main], t->d[main], t->inverse[main],
+                       t->o[side], t->d[side], t->inverse[side],
+                       t->o[axis], t->d[axis], t->inverse[axis], t->slack, t->tolerance,
+                       axis * across * along, turn ? 1 : along, turn ? along : 1,
+                       turn ? m : n, turn ? n : m};
+    return r;
+}
+
+inline void set_lane(GridRay16 *rays, uint k, const GridRay *r)
+{
+    LANE(rays->main_o, k) = r->main_o;
+    LANE(rays->main_d, k) = r->main_d;
+    LANE(rays->main_inverse, k) = r->main_inverse;
+    LANE(rays->side_o, k) = r->side_o;
+    LANE(rays->side_d, k) = r->side_d;
+    LANE(rays->depth_o, k) = r->depth_o;
+    LANE(rays->depth_d, k) = r->depth_d;
+    LANE(rays->slack, k) = r->slack;
+    LANE(rays->tolerance, k) = r->tolerance;
+    WHOLE_LANE(rays->first, k) = r->first;
+    WHOLE_LANE(rays->main_stride, k) = r->main_stride;
+    WHOLE_LANE(rays->side_stride, k) = r->side_stride;
+    WHOLE_LANE(rays->main, k) = r->main;
+    WHOLE_LANE(rays->side, k) = r->side;
+}
+
+// The slabs of depth over each column.
+inline ulong16 slabs_over(const Cube *cube, const Columns *c)
+{
+    const int16 last = SLABS - 1;
+    int16 a = CONVERT(int16, c->near * cube->per_slab), b = CONVERT(int16, c->far * cube->per_slab);
+    a = a < 0 ? 0 : a > last ? last : a;
+    b = b < 0 ? 0 : b > last ? last : b;
     const ulong16 one = 1ul;
-    *(ulong16 *)slabs = ((one + one) << CONVERT(ulong16, b)) - (one << CONVERT(ulong16, a));
+    return ((one + one) << CONVERT(ulong16, b)) - (one << CONVERT(ulong16, a));
+}
+
+// The columns in which these slabs are occupied. Most have one or two rows, which are looked up
+// without a branch; more, where blocks are narrow or the slack is large, are left to the visit.
+inline uint occupied_columns(const Cube *cube, const GridRay16 *r, Columns *c, const ulong *slabs)
+{
+    const int16 line = r->first + c->column * r->main_stride;
+    int16 lows = line + c->low * r->side_stride, highs = line + c->high * r->side_stride;
+    const uint many = MASK16(c->high > c->low + 1);
     uint mask = 0;
     for (uint rest = c->mask; rest != 0; rest &= rest - 1) {
         const uint k = LOWEST(rest);
-        const int low = WHOLE_LANE(c->low, k), high = WHOLE_LANE(c->high, k);
-        const uint line = image->first + WHOLE_LANE(c->column, k) * image->main_stride;
-        const ulong occupied = t->slabs[line + low * image->side_stride]
-                               | t->slabs[line + high * image->side_stride];
-        const bool meets = (occupied & slabs[k]) != 0 || high > low + 1;
-        mask |= (uint)meets << k;
+        const ulong occupied = cube->slabs[WHOLE_LANE(lows, k)] | cube->slabs[WHOLE_LANE(highs, k)];
+        mask |= (uint)((occupied & slabs[k]) != 0) << k;
     }
-    return mask;
+    return mask | (many & c->mask);
 }
 
-inline void walk(Trace *t, const GridRay *r, Span s)
+// The blocks of lane `k`'s column, by its ray.
+inline void visit_column(Trace *t, const GridRay *r, const GridRay16 *rays, Columns *c, uint k,
+                         ulong slabs)
 {
-    const Image *image = &r->blocks;
-    const int right = (t->resolution - 1) / image->main, top = (t->resolution - 1) / image->side;
-    ulong slabs[16] __attribute__((aligned(128)));
-    WALK(image, s, 0, right, 0, top, c.mask = occupied_columns(t, image, &c, slabs);, {
-        const int column = WHOLE_LANE(c.column, k);
-        const uint line = image->first + column * image->main_stride;
-        for (int row = WHOLE_LANE(c.low, k); row <= WHOLE_LANE(c.high, k); row++) {
-            const ulong occupied = t->slabs[line + row * image->side_stride] & slabs[k];
-            if (occupied == 0)
-                continue;
-            const Span q = row_piece(t, r, p, row, image->side);
-            const Span z = values(q, r->depth_o, r->depth_d, t->tolerance);
-            if (q.low <= q.high && (occupied & slabs_between(z.low, z.high, t->per_slab)) != 0)
-                walk_block(t, r, q, column * image->main, row * image->side);
-        }
-    })
+    const int column = WHOLE_LANE(c->column, k), stride = WHOLE_LANE(rays->side_stride, k);
+    const uint line = WHOLE_LANE(rays->first, k) + column * WHOLE_LANE(rays->main_stride, k);
+    const int2 size = (int2)(WHOLE_LANE(rays->main, k), WHOLE_LANE(rays->side, k));
+    for (int row = WHOLE_LANE(c->low, k); row <= WHOLE_LANE(c->high, k) && !done(t); row++) {
+        const ulong occupied = t->cube->slabs[line + row * stride] & slabs;
+        if (occupied == 0)
+            continue;
+        const Span p = {LANE(c->enter, k), MIN(LANE(c->leave, k), t->end)};
+        const Span q = row_piece(r, p, row, size.y);
+        const Span z = values(q, r->depth_o, r->depth_d, r->tolerance);
+        if (q.low <= q.high && (occupied & slabs_between(z.low, z.high, t->cube->per_slab)) != 0)
+            walk_texels(t, r, q, column * size.x, row * size.y, size);
+    }
 }
+
+// In the direction that is each ray's `turn`-th.
+inline void walk_blocks(Trace *t, uint num_rays, uint turn)
+{
+    const Cube *cube = t->cube;
+    GridRay texels[16];
+    GridRay16 blocks = {0.0f};
+    int16 first = 0, step = 0, count = 0;
+    float16 begin = 0.0f, end = -1.0f;
+    int most = 0;
+    for (uint k = 0; k < num_rays; k++) {
+        const Span s = {t[k].begin, t[k].end};
+        if (!(s.low <= s.high) || done(&t[k]))
+            continue;
+        texels[k] = seen_ray(&t[k], t[k].order[turn], 1, 1);
+        const GridRay r = seen_ray(&t[k], t[k].order[turn], cube->block.x, cube->block.y);
+        const Cells cells = cells_over(&r, s, 0, (cube->resolution - 1) / r.main);
+        set_lane(&blocks, k, &r);
+        WHOLE_LANE(first, k) = cells.first;
+        WHOLE_LANE(step, k) = cells.step;
+        WHOLE_LANE(count, k) = cells.count;
+        LANE(begin, k) = s.low;
+        LANE(end, k) = s.high;
+        most = MAX(most, cells.count);
+    }
+    const int16 top = (cube->resolution - 1) / (blocks.side > 1 ? blocks.side : 1);
+    for (int n = 0; n < most; n++) {
+        Columns c = cut_columns16(&blocks, first + n * step, begin, end, 0, top);
+        const uint left = MASK16((n < count) & (c.enter <= end));
+        if (left == 0) // nor later: the rays have ended
+            return;
+        c.mask &= left;
+        const ulong16 slabs = slabs_over(cube, &c);
+        for (uint mask = occupied_columns(cube, &blocks, &c, (const ulong *)&slabs); mask != 0;
+             mask &= mask - 1) {
+            const uint k = LOWEST(mask);
+            visit_column(&t[k], &texels[k], &blocks, &c, k, ((const ulong *)&slabs)[k]);
+            LANE(end, k) = done(&t[k]) ? -INFINITY : t[k].end;
+        }
+    }
+}
+
+// ---- rays ----
 
 inline float4 still(float4 d)
 {
@@ -374,30 +456,6 @@ inline Span enter_cube(const float *o, const float *d, const float *inverse, Spa
     return s;
 }
 
-// An image of direction `axis`, whose cells are n columns by m rows of texels; `turn`: its main
-// coordinate is that of the rows.
-inline Image image_of(uint axis, bool turn, int resolution, int n, int m)
-{
-    const uint across = (resolution - 1) / n + 1, along = (resolution - 1) / m + 1;
-    const uint first = axis * across * along;
-    const Image by_column = {first, along, 1, n, m}, by_row = {first, 1, along, m, n};
-    return turn ? by_row : by_column;
-}
-
-// The ray as direction `axis` sees it.
-inline GridRay seen_ray(uint axis, const float *o, const float *d, const float *inverse,
-                        int resolution, int2 block)
-{
-    const uint column = axis == 2 ? 0 : axis + 1, row = axis == 0 ? 2 : axis - 1;
-    const bool turn = size_of(d[row]) > size_of(d[column]);
-    const uint main = turn ? row : column, side = turn ? column : row;
-    const GridRay r = {o[main], d[main], inverse[main], o[side], d[side], inverse[side],
-                       o[axis], d[axis], inverse[axis],
-                       image_of(axis, turn, resolution, 1, 1),
-                       image_of(axis, turn, resolution, block.x, block.y)};
-    return r;
-}
-
 // The axes, along which the ray moves fastest first: it crosses the fewest texels of that image, and
 // surfaces that it meets head-on are there.
 inline void sort_axes(const float *d, uint *order)
@@ -410,51 +468,72 @@ inline void sort_axes(const float *d, uint *order)
     order[2] = turn ? a : b;
 }
 
-inline void trace(Trace *t, const Grid *grid, int2 block, uint num_triangles, float4 org_tnear,
-                  float4 dir_tfar)
+// The ray `t` in grid space; without a span where none of its t is within the cube.
+inline void aim(Trace *t, const Grid *grid, float4 org_tnear, float4 dir_tfar)
 {
     const float x = size_of(dir_tfar.x), y = size_of(dir_tfar.y), z = size_of(dir_tfar.z);
-    const float length = MAX(x, MAX(y, z)), resolution = (float)t->resolution;
+    const float length = MAX(x, MAX(y, z)), resolution = (float)t->cube->resolution;
     const float4 origin = to_grid(grid, org_tnear), direction = still(dir_tfar / length);
     const float4 far = MAX(size_of4(origin), size_of4(origin - resolution));
-    const float o[3] = {origin.x, origin.y, origin.z};
-    const float d[3] = {direction.x, direction.y, direction.z};
-    float inverse[3];
+    t->o[0] = origin.x, t->o[1] = origin.y, t->o[2] = origin.z;
+    t->d[0] = direction.x, t->d[1] = direction.y, t->d[2] = direction.z;
     for (uint k = 0; k < 3; k++)
-        inverse[k] = d[k] == 0.0f ? 0.0f : 1.0f / d[k];
+        t->inverse[k] = t->d[k] == 0.0f ? 0.0f : 1.0f / t->d[k];
+    sort_axes(t->d, t->order);
     t->slack = SLACK * MAX(far.x, MAX(far.y, far.z));
-    if (!(t->slack <= 0.25f * resolution)) {
-#ifdef CONSERVATIVE
-        for (uint i = 0; i < num_triangles && !done(t); i++)
-            test_triangle(t, i);
-#endif
-        return;
-    }
     t->tolerance += t->slack;
     t->per_t = length * grid->per_unit;
     Span s = {org_tnear.w * t->per_t, t->frame.tfar * t->per_t};
     s.low -= s.low * 0x1p-20f + t->slack;
     s.high += s.high * 0x1p-20f + t->slack;
-    s = enter_cube(o, d, inverse, s, t->slack, resolution);
+    s = enter_cube(t->o, t->d, t->inverse, s, t->slack, resolution);
+    t->begin = s.low;
     t->end = s.high;
-    uint order[3];
-    sort_axes(d, order);
-    for (uint k = 0; k < 3 && !done(t); k++) {
-        const GridRay r = seen_ray(order[k], o, d, inverse, t->resolution, block);
-        const Span rest = {s.low, MIN(s.high, t->end)};
-        if (rest.low <= rest.high)
-            walk(t, &r, rest);
-    }
 }
 
+inline bool is_far(const Trace *t) { return !(t->slack <= 0.25f * (float)t->cube->resolution); }
+
+// A ray from too far away to be led through the cube.
+inline void trace_far(Trace *t)
+{
 #ifdef CONSERVATIVE
-#define SET_ENDS(t, org, dir)
-#else
-#define SET_ENDS(t, org, dir)                                                                      \
-    t.start = org + t.frame.tnear * dir;                                                           \
-    t.stop = t.frame.tfar < MAXFLOAT ? org + t.frame.tfar * dir : t.start;                         \
-    t.margin = t.tolerance / g.per_unit + g.edge;
+    for (uint i = 0; i < t->cube->num_triangles && !done(t); i++)
+        test_triangle(t, i);
 #endif
+    t->end = -INFINITY;
+}
+
+inline Trace start_ray(const Cube *cube, const Grid *grid, float4 org_tnear, float4 dir_tfar,
+                       float tolerance, bool any)
+{
+    Trace t = {cube};
+    t.tolerance = tolerance * grid->diagonal * grid->per_unit;
+    t.frame = ray_frame(org_tnear, dir_tfar);
+    t.nearest = MISS;
+    t.any = any;
+    for (uint k = 0; k < MAILBOX; k++)
+        t.tested[k] = INVALID;
+#ifndef CONSERVATIVE
+    t.start = org_tnear + t.frame.tnear * dir_tfar;
+    t.stop = t.frame.tfar < MAXFLOAT ? org_tnear + t.frame.tfar * dir_tfar : t.start;
+    t.margin = t.tolerance / grid->per_unit + grid->edge;
+#endif
+    aim(&t, grid, org_tnear, dir_tfar);
+    return t;
+}
+
+inline bool is_active(const Trace *t) { return t->frame.tfar >= t->frame.tnear; }
+
+inline void trace(Trace *t, uint num_rays)
+{
+    for (uint k = 0; k < num_rays; k++)
+        if (!is_active(&t[k]))
+            t[k].end = -INFINITY;
+        else if (is_far(&t[k]))
+            trace_far(&t[k]);
+    for (uint turn = 0; turn < 3; turn++)
+        walk_blocks(t, num_rays, turn);
+}
 
 // Work-item g takes RAYS consecutive rays. counts[3g]: active rays, triangles or samples tested,
 // hits.
@@ -469,34 +548,32 @@ inline void trace(Trace *t, const Grid *grid, int2 block, uint num_triangles, fl
                      global ulong *restrict counts)                                                \
     {                                                                                              \
         const Grid g = load_grid(grid);                                                            \
+        const Cube cube = {resolution, block, (float)SLABS / (float)resolution, first,             \
+                           {near, far, triangle}, slabs, triangles, num_triangles};                \
         const uint begin = get_global_id(0) * RAYS, end = MIN(begin + RAYS, num_rays);             \
         ulong active = 0, tests = 0, hits = 0;                                                     \
-        for (uint i = begin; i < end; i++) {                                                       \
-            Trace t = {resolution, 0.0f, tolerance * g.diagonal * g.per_unit,                      \
-                       (float)SLABS / (float)resolution, first, {near, far, triangle}, slabs,      \
-                       triangles};                                                                 \
-            t.frame = ray_frame(org_tnear[i], dir_tfar[i]);                                        \
-            t.nearest = MISS;                                                                      \
-            t.tests = t.hits = 0;                                                                  \
-            t.any = ANY;                                                                           \
-            for (uint k = 0; k < MAILBOX; k++)                                                     \
-                t.tested[k] = INVALID;                                                             \
-            SET_ENDS(t, org_tnear[i], dir_tfar[i])                                                 \
-            if (t.frame.tfar >= t.frame.tnear) {                                                   \
-                trace(&t, &g, block, num_triangles, org_tnear[i], dir_tfar[i]);                    \
-                active++;                                                                          \
+        Trace t[16];                                                                               \
+        for (uint i = begin; i < end; i += 16) {                                                   \
+            const uint n = MIN(end - i, 16u);                                                      \
+            for (uint k = 0; k < n; k++)                                                           \
+                t[k] = start_ray(&cube, &g, org_tnear[i + k], dir_tfar[i + k], tolerance, ANY);    \
+            trace(t, n);                                                                           \
+            for (uint k = 0; k < n; k++) {                                                         \
+                result[i + k] = STORE(t[k].nearest);                                               \
+                active += is_active(&t[k]);                                                        \
+                tests += t[k].tests;                                                               \
+                hits += t[k].hits;                                                                 \
             }                                                                                      \
-            result[i] = STORE;                                                                     \
-            tests += t.tests;                                                                      \
-            hits += t.hits;                                                                        \
         }                                                                                          \
         counts[3 * get_global_id(0)] = active;                                                     \
         counts[3 * get_global_id(0) + 1] = tests;                                                  \
         counts[3 * get_global_id(0) + 2] = hits;                                                   \
     }
 
-DEFINE_TRACE(intersect_ldc, ulong, false, t.nearest)
-DEFINE_TRACE(occlude_ldc, uchar, true, t.nearest != MISS)
+#define KEY(nearest) (nearest)
+#define BLOCKED(nearest) ((nearest) != MISS)
+DEFINE_TRACE(intersect_ldc, ulong, false, KEY)
+DEFINE_TRACE(occlude_ldc, uchar, true, BLOCKED)
 
 // Hits from keys in the published mode: t is the ray's, u and v are the stored sample's (section
 // 1.4), that of the texel in which the ray then is.
