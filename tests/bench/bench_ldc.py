@@ -66,7 +66,7 @@ def pictures(options):
     """SSIM and wrong hits in both sizes; side by side: by cube maps, by ldc, by Embree."""
     heads = ["ssim", *(f"ssim, {answer}" for answer in ANSWERS[1:])]
     print("| scene | triangles | size |", " | ".join(heads),
-          "| rays wrong: missed, phantom, distant | shadow rays wrong |")  # fmt: skip
+          "| rays wrong: missed, phantom, distant | shadow rays: missed, phantom |")  # fmt: skip
     low = []
     for name in tqdm(chosen(options, SCENES), disable=None):
         scene = SCENES[name](options.folder)
@@ -82,15 +82,14 @@ def pictures(options):
 
 
 def print_judgement(name, scene, size, judgement):
-    closest, shadow = judgement.closest, judgement.shadow
     scores = " | ".join(f"{judgement.ssim[answer]:.4f}" for answer in ANSWERS)
-    shares = ", ".join(f"{getattr(closest, r) / max(1, closest.rays):.3%}" for r in REASONS)
-    print(
-        f"| {name} | {scene.num_triangles} | {size} | {scores} "
-        f"| {closest.share:.3%} of {closest.rays}: {shares} "
-        f"| {shadow.share:.3%} of {shadow.rays} |",
-        flush=True,
-    )
+    wrong = f"{shares(judgement.closest, REASONS)} | {shares(judgement.shadow, REASONS[:2])}"
+    print(f"| {name} | {scene.num_triangles} | {size} | {scores} | {wrong} |", flush=True)
+
+
+def shares(wrong, reasons):
+    parts = ", ".join(f"{getattr(wrong, r) / max(1, wrong.rays):.2%}" for r in reasons)
+    return f"{wrong.share:.2%} of {wrong.rays}: {parts}"
 
 
 def tolerances(options):

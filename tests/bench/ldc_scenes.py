@@ -97,7 +97,7 @@ def _teapots(folder):
     x, z = 9.0, 6.0
     mirror = from_shape("mirror", shapes.quads([[(-x, 0, z), (x, 0, z), (x, 0, -z), (-x, 0, -z)]]),
                         diffuse=0.05, reflectivity=0.8, specular=0.5, shininess=200.0)  # fmt: skip
-    camera = rs.Camera.look_at((0.5, 6.0, 13.0), (0.0, 1.0, 0.0), fov_y=45.0)
+    camera = rs.Camera.look_at((0.0, 6.5, 15.0), (0.0, 0.8, 0.0), fov_y=45.0)
     lights = [rs.PointLight((-6, 10, 8), 0.75), rs.PointLight((8, 7, 6), 0.35)]
     balls = _balls((0.0, 0.0, 0.0), 0.0, 6.5)
     return rs.Scene([*pots, mirror, *balls], lights, camera, _SKY, 0.12, "teapots")
@@ -116,13 +116,21 @@ def _maple(folder):
     return rs.Scene([*tree, ground], [light], camera, _SKY, 0.15, "japanese-maple")
 
 
+def _ring(_folder):
+    """A ring of 20,480 triangles, the number of the paper's car, that mirrors its inside."""
+    vertices, faces = shapes.torus(1.0, 0.32, 160, 64)
+    upright = shapes.turn(vertices, "x", 1.1)
+    ring = from_shape("ring", (upright, faces), True)
+    return _stage("ring", [_mirrored(ring, (0.5, 0.35, 0.1), 0.6)])
+
+
 def _bumpy(_folder):
     return rs.scenes.bumpy_mirror(3)
 
 
 SCENES = {
     "bunny": _statue("bunny/bunny-16301.ply", (0.35, 0.3, 0.25)),
-    "bumpy-mirror": _bumpy,
+    "ring": _ring,
     "dragon": _statue("dragon/dragon-47794.ply", (0.12, 0.35, 0.22)),
     **{
         f"elephant-{key:02}": _statue(f"elephant-skin/elephant-{key:02}.ply", (0.3, 0.3, 0.35))
@@ -130,4 +138,5 @@ SCENES = {
     },
     "teapots": _teapots,
     "maple": _maple,
+    "bumpy-mirror": _bumpy,
 }
