@@ -48,7 +48,7 @@ from raystream import image as images
 
 PICTURE_SIZES = (512, 1024)
 MIN_SSIM = 0.95
-TOLERANCES = (0.0, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 4e-3)
+TOLERANCES = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # in texels
 EXACT_SCENES = ("bunny", "sponza", "office", "kitchen", "gears")  # of COUNT_SCENES
 SOUPS = {"soup-1k": (1000, 0.3), "soup-20k": (20_000, 0.1), "soup-200k": (200_000, 0.03)}
 MODELS = {
@@ -93,28 +93,34 @@ def shares(wrong, reasons):
 
 
 def tolerances(options):
-    """SSIM at 512 and 1024 by tolerance, as a table and a plot."""
+    """SSIM in both sizes by tolerance, as a table and a plot."""
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, len(PICTURE_SIZES), figsize=(9, 3.6), sharey=True)
-    print("| scene | size |", " | ".join(f"{t:g}" for t in TOLERANCES), "|")
+    heads = " | ".join(f"{texels:g}" for texels in TOLERANCES)
+    print(f"| scene | size | tolerance in texels: {heads} |")
     for name in tqdm(chosen(options, SCENES), disable=None):
         scene = SCENES[name](options.folder)
         for size, ax in zip(PICTURE_SIZES, axes, strict=True):
-            reference = render_reference(scene, scene.camera, (size, size)).image
-            scores = [
-                judge(scene, size, (PUBLISHED,), reference, tolerance=tolerance).ssim[PUBLISHED]
-                for tolerance in TOLERANCES
-            ]
+            scores = scores_by_tolerance(scene, size)
             print(f"| {name} | {size} |", " | ".join(f"{s:.4f}" for s in scores), "|", flush=True)
-            ax.plot(1e3 * np.array(TOLERANCES), scores, "o-", label=name, markersize=3)
-            ax.set(title=f"{size} x {size}", xlabel="tolerance, thousandths of the diagonal")
-            ax.set_xscale("symlog", linthresh=0.1)
+            ax.plot(TOLERANCES, scores, "o-", label=name, markersize=3)
+            ax.set(title=f"{size} x {size}", xlabel="tolerance, texels")
+            ax.set_xscale("symlog", base=2, linthresh=TOLERANCES[1])
             ax.axhline(MIN_SSIM, color="grey", linewidth=0.5)
     axes[0].set_ylabel("SSIM against the reference")
     axes[0].legend(fontsize=7)
     save(figure, folder(options.tolerance) / "ldc-tolerance.png")
     return 0
+
+
+def scores_by_tolerance(scene, size):
+    reference = render_reference(scene, scene.camera, (size, size)).image
+    texel = np.ptp(scene.bounds, axis=0).max() / size / scene.diagonal
+    return [
+        judge(scene, size, (PUBLISHED,), reference, tolerance=texels * texel).ssim[PUBLISHED]
+        for texels in TOLERANCES
+    ]
 
 
 # ---- the exact mode: rays against Embree ----

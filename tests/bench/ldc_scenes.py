@@ -106,13 +106,12 @@ def _teapots(folder):
 def _maple(folder):
     """A tree of 198,396 triangles, whose leaves throw shadows on each other and on the ground."""
     tree = _file(folder, "foliage/japanese-maple.glb")
-    half, middle = 600.0, np.array([70.0, 0.0, 75.0])
-    x, z = middle[0], middle[2]
+    x, z, half = 70.0, 75.0, 395.0  # as wide as the tree: the cube is the tree's
     quad = [(x - half, -0.02, z + half), (x + half, -0.02, z + half),
             (x + half, -0.02, z - half), (x - half, -0.02, z - half)]  # fmt: skip
     ground = from_shape("ground", shapes.quads([quad]), diffuse=(0.7, 0.68, 0.6))
-    camera = rs.Camera.look_at((70, 550, 1500), (70, 270, 60), fov_y=42.0)
-    light = rs.PointLight((-500, 1500, 600), 0.9)
+    camera = rs.Camera.look_at((70, 650, 1350), (70, 300, 60), fov_y=42.0)
+    light = rs.PointLight((-300, 2000, 500), 0.9)
     return rs.Scene([*tree, ground], [light], camera, _SKY, 0.15, "japanese-maple")
 
 
