@@ -49,7 +49,8 @@ from raystream import image as images
 PICTURE_SIZES = (512, 1024)
 MIN_SSIM = 0.95
 TOLERANCES = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # in texels
-EXACT_SCENES = ("bunny", "sponza", "office", "kitchen", "gears")  # of COUNT_SCENES
+_REAL = (COUNT_SCENES[name] for name in ("bunny", "sponza", "office", "kitchen", "gears"))
+EXACT_SCENES = {real.name: real for real in _REAL}
 SOUPS = {"soup-1k": (1000, 0.3), "soup-20k": (20_000, 0.1), "soup-200k": (200_000, 0.03)}
 MODELS = {
     "bunny": [f"bunny/bunny-{count}.ply" for count in (948, 3851, 16301, 69451)],
@@ -150,7 +151,7 @@ def exact(options):
 def exact_scene(name, files):
     if name in SOUPS:
         return triangle_soup(np.random.default_rng(1), *SOUPS[name])
-    return COUNT_SCENES[name].load(files)
+    return EXACT_SCENES[name].load(files)
 
 
 def ray_kinds(scene, rng, count):
@@ -255,7 +256,7 @@ def blocks(options):
     """Traversal of a frame's rays with the coarse level and without, in turn."""
     gains = {False: {}, True: {}}
     for name in tqdm(chosen(options, [*SCENES, *EXACT_SCENES]), disable=None):
-        real = None if name in SCENES else COUNT_SCENES[name]
+        real = EXACT_SCENES.get(name)
         scene = real.load(options.folder) if real else SCENES[name](options.folder)
         camera = real.camera if real else scene.camera
         for mode in gains:

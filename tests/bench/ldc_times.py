@@ -20,7 +20,7 @@ from raystream.statistics import TRAVERSAL
 
 RESOLUTIONS = (512, 1024)
 VIEWPORT = (1280, 1024)  # of the paper
-ROUNDS = 5
+ROUNDS = 9
 GROWTH_RAYS = 1 << 18
 
 
