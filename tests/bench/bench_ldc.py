@@ -18,10 +18,11 @@ import pathlib
 import sys
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent.parent))
 
-from cube_map import render_cube_map
+from cube_map import CubeMap, render_cube_map
 from ldc_pictures import ANSWERS, PUBLISHED, REASONS, judge
 from ldc_scenes import SCENES
 from ldc_times import (
@@ -37,6 +38,7 @@ from ldc_times import (
     table_row,
 )
 from raystream.baselines import EmbreeTracer, render_reference
+from raystream.baselines.reference import primary_rays
 from raystream.baselines.tolerance import MAX_SHARE, differing, differing_occlusion
 from real_scenes import BUNNY, COUNT_SCENES
 from soup import triangle_soup
@@ -271,6 +273,30 @@ def blocks(options):
         print(f"{label}: geometric mean of {len(of_mode)} scenes {mean:.2f}")
         low += [] if mean >= MIN_GAIN else [label]
     return verdict(f"gain below {MIN_GAIN}", low)
+
+
+# ---- under pytest (`make bench`) ----
+
+
+@pytest.mark.parametrize("exact", MODES, ids=MODES.get)
+def test_construction_of_the_bunny(benchmark, scene_folder, exact):
+    benchmark(Builder(rs.load_scene(scene_folder / BUNNY.path), exact=exact).build)
+
+
+@pytest.mark.parametrize("exact", MODES, ids=MODES.get)
+def test_frame_of_the_mirroring_bunny(benchmark, scene_folder, exact):
+    benchmark(rs.Renderer(SCENES["bunny"](scene_folder), "ldc", exact=exact).render)
+
+
+def test_a_cube_map_shows_what_a_camera_sees_from_its_centre():
+    scene, centre = rs.scenes.cornell(), np.array([270.0, 400.0, 150.0])
+    cubes = CubeMap(scene, centre, size=256)
+    camera = rs.Camera.look_at(centre, centre + [0.7, -1.0, 0.4], fov_y=80.0)
+    rays = primary_rays(camera, (96, 96), (0.5, 0.5))
+    seen = cubes.look_up(rays.directions).reshape(96, 96, 3)
+    expected = render_reference(scene, camera, (96, 96), max_bounces=0).image
+    assert np.median(np.abs(seen - expected)) < 1e-3  # but for edges and rims of shadows
+    assert np.mean(np.abs(seen - expected).max(axis=2) > 0.02) < 0.05
 
 
 # ---- the command ----
