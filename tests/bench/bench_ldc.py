@@ -208,23 +208,20 @@ def growths(options):
     from matplotlib import pyplot
 
     figure, (build, trace) = pyplot.subplots(1, 2, figsize=(9, 3.6))
-    print("| model | triangles |", " | ".join(
-        f"{what} at {r}" for r in RESOLUTIONS for what in ("construction, ms", "tracing, ns a ray")
-    ), "|")  # fmt: skip
+    print("| model | resolution | triangles | construction, ms | tracing, ns a ray |")
     for (model, paths), colour in zip(MODELS.items(), ("tab:blue", "tab:orange"), strict=True):
-        grown = []
-        for path in tqdm(paths, disable=None):
-            grown.append(growth(rs.load_scene(pathlib.Path(options.folder) / path)))
-            cells = (f"{1e3 * grown[-1].construction[r]:.1f} | {1e9 * grown[-1].tracing[r]:.0f}"
-                     for r in RESOLUTIONS)  # fmt: skip
-            print(f"| {model} | {grown[-1].triangles} |", " | ".join(cells), "|", flush=True)
+        scenes = [rs.load_scene(pathlib.Path(options.folder) / path) for path in paths]
+        triangles = [scene.num_triangles for scene in scenes]
         for resolution, style in zip(RESOLUTIONS, ("o--", "o-"), strict=True):
-            for ax, key, unit in ((build, "construction", 1e3), (trace, "tracing", 1e9)):
-                times = [unit * getattr(g, key)[resolution] for g in grown]
-                ax.loglog([g.triangles for g in grown], times, style, color=colour,
-                          label=f"{model}, {resolution}")  # fmt: skip
+            construction, tracing = growth(scenes, resolution)
+            for row in zip(triangles, construction, tracing, strict=True):
+                print(f"| {model} | {resolution} | {row[0]} | {1e3 * row[1]:.1f} "
+                      f"| {1e9 * row[2]:.0f} |", flush=True)  # fmt: skip
+            look = {"color": colour, "label": f"{model}, {resolution}", "markersize": 4}
+            build.loglog(triangles, 1e3 * np.array(construction), style, **look)
+            trace.semilogx(triangles, 1e9 * np.array(tracing), style, **look)
     build.set(xlabel="triangles", ylabel="construction, ms", ylim=(1, None))
-    trace.set(xlabel="triangles", ylabel="tracing, ns a ray")
+    trace.set(xlabel="triangles", ylabel="tracing, ns a ray", ylim=(0, None))
     trace.legend(fontsize=7)
     save(figure, folder(options.growth) / "ldc-growth.png")
     return 0

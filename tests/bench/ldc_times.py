@@ -61,6 +61,7 @@ class Builder:
 
     def build(self):
         """The cube, of triangles that are on the device."""
+        self.cube = None  # its memory is used again, as between frames
         self.cube = LayeredDepthCube(self.session, self.geometry, **self._options)
         self.session.finish()
 
@@ -106,25 +107,14 @@ def published():
 # ---- growth with triangles ----
 
 
-@dataclasses.dataclass
-class Growth:
-    """Seconds by resolution for one mesh: of construction, and of each ray."""
+def growth(scenes, resolution):
+    """Median seconds of construction, and of each ray, for versions of a model, in turn.
 
-    triangles: int
-    construction: dict
-    tracing: dict
-
-
-def growth(scene):
-    """Of all versions of a model alike: the rays go from a sphere around its box into the box."""
-    construction, tracing = {}, {}
-    rays = rays_into(scene, np.random.default_rng(7), GROWTH_RAYS)
-    for resolution in RESOLUTIONS:
-        builder = Builder(scene, resolution=resolution)
-        (times,) = in_turn(builder.build)
-        construction[resolution] = float(np.median(times))
-        tracing[resolution] = traversal_seconds(scene, rays, resolution=resolution) / GROWTH_RAYS
-    return Growth(scene.num_triangles, construction, tracing)
+    The rays go from a sphere around a version's box into the box.
+    """
+    construction = in_turn(*(Builder(scene, resolution=resolution).build for scene in scenes))
+    tracing = in_turn(*(tracing_of(scene, resolution) for scene in scenes))
+    return [np.median(t) for t in construction], [np.median(t) / GROWTH_RAYS for t in tracing]
 
 
 def rays_into(scene, rng, count, distance=1.0):
@@ -136,16 +126,17 @@ def rays_into(scene, rng, count, distance=1.0):
     return origins, low + (high - low) * rng.random((count, 3)) - origins
 
 
-def traversal_seconds(scene, rays, rounds=3, **options):
-    """Median device time of the closest hits of some rays."""
-    session = device.session()
-    stream = from_numpy(session, *rays, 0.0, np.inf)
-    tracer, times = rs.Tracer(scene, "ldc", **options), []
-    for _ in range(rounds + 1):
-        session.finish()
+def tracing_of(scene, resolution):
+    """A call that traces `GROWTH_RAYS` rays through the scene's cube, which stays."""
+    session, rng = device.session(), np.random.default_rng(7)
+    stream = from_numpy(session, *rays_into(scene, rng, GROWTH_RAYS), 0.0, np.inf)
+    tracer = rs.Tracer(scene, "ldc", resolution=resolution)
+
+    def trace():
         tracer.intersect_stream(session, stream)
-        times.append(session.finish()[TRAVERSAL]["device"])
-    return statistics.median(times[1:])
+        session.finish()
+
+    return trace
 
 
 # ---- Embree's build ----
