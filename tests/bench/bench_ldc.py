@@ -39,7 +39,7 @@ from ldc_times import (
 )
 from raystream.baselines import EmbreeTracer, render_reference
 from raystream.baselines.reference import primary_rays
-from raystream.baselines.tolerance import MAX_SHARE, differing, differing_occlusion
+from raystream.baselines.tolerance import MAX_SHARE, VERDICTS, differing, differing_occlusion
 from real_scenes import BUNNY, COUNT_SCENES
 from soup import triangle_soup
 from tqdm import tqdm
@@ -131,6 +131,8 @@ def scores_by_tolerance(scene, size):
 
 def exact(options):
     """Closest and any hits of `options.rays` rays of each kind, by the rules of tolerance.py."""
+    heads = " | ".join(VERDICTS)
+    print(f"| scene | triangles | rays | query | hit | differ | of these right: {heads} |")
     failed = []
     for name in tqdm(chosen(options, [*EXACT_SCENES, *SOUPS]), disable=None):
         scene, rng = exact_scene(name, options.folder), np.random.default_rng(2007)
@@ -144,8 +146,10 @@ def exact(options):
             agreements["any"] = differing_occlusion(blocked, expected, *triangles, *segments)
             for query, agreement in agreements.items():
                 hit = np.mean(ours.prim_id >= 0 if query == "closest" else blocked)
-                print(f"{name}, {scene.num_triangles} triangles, rays {kind}, {query} hit: "
-                      f"{agreement}; {hit:.0%} hit", flush=True)  # fmt: skip
+                counts = " | ".join(str(agreement.count(verdict)) for verdict in VERDICTS)
+                differ = f"{len(agreement.rays)} of {agreement.num_rays}"
+                print(f"| {name} | {scene.num_triangles} | {kind} | {query} | {hit:.0%} "
+                      f"| {differ} | {counts} |", flush=True)  # fmt: skip
                 failed += [] if agreement.ok else [f"{name}/{kind}/{query}"]
     return verdict(f"more than {MAX_SHARE:g} of the rays wrong", failed)
 
