@@ -132,7 +132,7 @@ def scores_by_tolerance(scene, size):
 def exact(options):
     """Closest and any hits of `options.rays` rays of each kind, by the rules of tolerance.py."""
     heads = " | ".join(VERDICTS)
-    print(f"| scene | triangles | rays | query | hit | differ | of these right: {heads} |")
+    print(f"| scene | triangles | rays | query | hit | differ | verdicts: {heads} |")
     failed = []
     for name in tqdm(chosen(options, [*EXACT_SCENES, *SOUPS]), disable=None):
         scene, rng = exact_scene(name, options.folder), np.random.default_rng(2007)
