@@ -67,9 +67,9 @@ MIN_GAIN = 3  # of tracing by the coarse level
 
 def pictures(options):
     """SSIM and wrong hits in both sizes; side by side: by cube maps, by ldc, by Embree."""
-    heads = ["ssim", *(f"ssim, {answer}" for answer in ANSWERS[1:])]
-    print("| scene | triangles | size |", " | ".join(heads),
-          "| rays wrong: missed, phantom, distant | shadow rays: missed, phantom |")  # fmt: skip
+    scores = " | ".join(["ssim", *(f"ssim, {answer}" for answer in ANSWERS[1:])])
+    wrong = f"rays wrong: {', '.join(REASONS)} | shadow rays: {', '.join(REASONS[:2])}"
+    print(f"| scene | triangles | size | {scores} | {wrong} |")
     low = []
     for name in tqdm(chosen(options, SCENES), disable=None):
         scene = SCENES[name](options.folder)

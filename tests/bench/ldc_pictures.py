@@ -9,7 +9,7 @@ from raystream.baselines.tolerance import ssim
 import raystream as rs
 
 APART = 0.005  # of the scene's diagonal: five tolerances
-MISSED, PHANTOM, DISTANT = REASONS = ("missed", "phantom", "distant")
+REASONS = ("missed", "phantom", "early", "late")
 # What becomes of the published answers: taken as they are; the wrong ones replaced by Embree's, so
 # that only inexact hits are left; the others replaced, so that only wrong ones are.
 PUBLISHED, NO_WRONG, ONLY_WRONG = ANSWERS = ("published", "no wrong hits", "only wrong hits")
@@ -20,13 +20,14 @@ class WrongHits:
     """How many rays were traced, and how many of them were answered wrongly, by reason.
 
     A closest hit is wrong where Embree hits and `ldc` misses (missed), the other way about
-    (phantom), or their hits are more than `APART` of the diagonal from each other (distant).
+    (phantom), or that of `ldc` is nearer (early) or farther (late) by over `APART` of the diagonal.
     """
 
     rays: int = 0
     missed: int = 0
     phantom: int = 0
-    distant: int = 0
+    early: int = 0
+    late: int = 0
 
     def add(self, *wrong):
         """Add the rays with an array of bool for each reason."""
@@ -37,7 +38,7 @@ class WrongHits:
     @property
     def share(self):
         """Of wrong answers among all."""
-        return (self.missed + self.phantom + self.distant) / max(1, self.rays)
+        return sum(getattr(self, reason) for reason in REASONS) / max(1, self.rays)
 
 
 class JudgedTracer:
@@ -84,10 +85,9 @@ class JudgedTracer:
 
     def _reasons(self, ours, theirs, lengths):
         hit, expected = ours.prim_id >= 0, theirs.prim_id >= 0
-        distant = hit & expected
-        gap = np.abs(ours.t[distant] - theirs.t[distant]) * lengths[distant]
-        distant[distant] = gap > self._apart
-        return expected & ~hit, hit & ~expected, distant
+        gap, both = np.zeros(len(hit)), hit & expected
+        gap[both] = (ours.t[both] - theirs.t[both]) * lengths[both]
+        return expected & ~hit, hit & ~expected, gap < -self._apart, gap > self._apart
 
     def _by_embree(self, wrong):
         if self._answer == PUBLISHED:
