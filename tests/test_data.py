@@ -9,8 +9,8 @@ import raystream.data
 FOLDER = pathlib.Path(raystream.data.__file__).parent
 
 
-def rows(**wanted):
-    with open(FOLDER / "crsh17.csv", newline="") as file:
+def rows(name="crsh17.csv", **wanted):
+    with open(FOLDER / name, newline="") as file:
         table = list(csv.DictReader(file))
     return [r for r in table if all(r[key] == value for key, value in wanted.items())]
 
@@ -28,3 +28,15 @@ def test_counts_of_the_coherent_hierarchy_tie_up(scene, algorithm):
         tests += int(above["tests"]) + int(below["tests"]) + 8 * int(below["hits"])
     (total,) = rows(level="total", **parts)
     assert int(total["tests"]) == tests
+
+
+def test_times_of_the_layered_depth_cube_are_whole():
+    """Five scenes in two resolutions; four times the texels cost more, but never four times."""
+    coarse, fine = (rows("ldc07.csv", resolution=size) for size in ("512", "1024"))
+    assert len(coarse) == len(fine) == 5
+    assert {int(row["layers"]) for row in coarse} == {6, 7, 8, 12}
+    for below, above in zip(coarse, fine, strict=True):
+        for key in ("scene", "triangles", "layers"):
+            assert below[key] == above[key]
+        for key in ("construction_ms", "tracing_ms"):
+            assert 1 < int(above[key]) / int(below[key]) < 4
