@@ -234,7 +234,7 @@ kernel void place_samples(const int resolution, global const float4 *restrict gr
         const int row = i % resolution, column = i / resolution % resolution;
         for (uint k = first[i]; k < first[i + 1]; k++) {
             global const float4 *corners = triangles + TRIANGLE_FLOAT4S * (ulong)triangle[k];
-            const float2 weights = weights_at(&g, corners, column, row);
+            const float2 weights = weights_at(&g, corners, column + 0.5f, row + 0.5f);
             depth[k] = depth_of(near[k]) * g.edge;
             u[k] = weights.x;
             v[k] = weights.y;

@@ -335,15 +335,15 @@ inline void rasterise(const uint mode, const Sink *sink, const Grid *grid, int r
     fill(mode, sink, axis * (uint)resolution * resolution, resolution, triangle, p);
 }
 
-// Weights u, v of the point of a triangle seen at the middle of a texel in the image of its
-// direction; of the nearest point within its outline where that is beside it.
-inline float2 weights_at(const Grid *grid, global const float4 *corners, int column, int row)
+// Weights u, v of the point of a triangle seen at a place in the image of its direction; of a point on
+// its outline where that is beside it.
+inline float2 weights_at(const Grid *grid, global const float4 *corners, float column, float row)
 {
     const float4 a = to_grid(grid, corners[0]);
     const float4 b = to_grid(grid, corners[1]) - a, c = to_grid(grid, corners[2]) - a;
     const uint axis = axis_of(cross3(b, c));
     const float4 o = seen_along(axis, a), e = seen_along(axis, b), f = seen_along(axis, c);
-    const float x = (float)column + 0.5f - o.x, y = (float)row + 0.5f - o.y;
+    const float x = column - o.x, y = row - o.y;
     const float area = e.x * f.y - e.y * f.x;
     float2 weights = (float2)(x * f.y - y * f.x, e.x * y - e.y * x) / area;
     weights = weights > 0.0f ? weights : 0.0f; // NaN of a zero area becomes 0

@@ -8,8 +8,10 @@
 // four): rays over the blocks, each over a column of its own; columns of texels in a block, of one
 // ray; the layers of a texel.
 //
-// Published mode: a hit is a sample within the tolerance of the ray's depths over its texel; the
-// samples of the surface that a ray starts or ends on are no hits (`touches`).
+// Published mode (POINTS): a hit is a sample within the tolerance of the ray's depths over its texel.
+// By default a sample is a piece of its triangle's plane, as large as its texel: the depth and normal
+// that the paper stores say where. The samples of the surface that a ray starts or ends on are no
+// hits (`touches`).
 //
 // Why no hit of the watertight test is lost (CONSERVATIVE), with u = 2^-24 and R the largest
 // coordinate of a corner of the cube seen from the ray's origin. The test's edge functions have the
@@ -24,7 +26,8 @@
 // Coordinates should lie between about 1e-15 and 1e15, as the test itself needs it. Rays whose
 // slack exceeds a quarter of the cube, from 16,000 cubes away, are tested against all triangles.
 //
-// Build-time constants: RAYS, rays to a work-item, a multiple of 16; those of cube.h.
+// Build-time constants: RAYS, rays to a work-item, a multiple of 16; POINTS, where defined; those of
+// cube.h.
 
 #pragma OPENCL EXTENSION cl_khr_int64_base_atomics : enable
 #pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
@@ -79,7 +82,7 @@ typedef struct {
     uint tests, hits;
     bool any; // one hit is enough
 #ifndef CONSERVATIVE
-    float4 start, stop; // of the ray, in space; the same where it has no end
+    float4 org, dir, start, stop; // in space; the last two are the same where the ray has no end
     float margin;
 #endif
 } Trace;
@@ -137,15 +140,22 @@ inline void test_triangle(Trace *t, uint triangle)
 inline bool done(const Trace *t) { return t->any && t->nearest != MISS; }
 
 #ifndef CONSERVATIVE
+
+// Not of unit length, but never out of the range of float; NaN for a triangle in one point.
+inline float4 normal_of(global const float4 *v)
+{
+    const float4 ab = v[1] - v[0], ac = v[2] - v[0];
+    const float4 m = MAX(size_of4(ab), size_of4(ac));
+    const float scale = MAX(m.x, MAX(m.y, m.z));
+    return cross3(ab / scale, ac / scale);
+}
+
 // Whether the ray starts or ends on the triangle's plane, as far as samples tell: a tolerance and a
 // texel. All rays from a surface, and from a light to it, would be caught by its own samples.
 inline bool touches(const Trace *t, uint triangle)
 {
     global const float4 *v = t->cube->triangles + TRIANGLE_FLOAT4S * (ulong)triangle;
-    const float4 a = v[0], ab = v[1] - a, ac = v[2] - a;
-    const float4 m = MAX(size_of4(ab), size_of4(ac));
-    const float scale = MAX(m.x, MAX(m.y, m.z));
-    const float4 n = cross3(ab / scale, ac / scale);
+    const float4 a = v[0], n = normal_of(v);
     const float reach = t->margin * sqrt(dot3(n, n));
     return size_of(dot3(t->start - a, n)) <= reach || size_of(dot3(t->stop - a, n)) <= reach;
 }
@@ -162,18 +172,42 @@ inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
 
 #else
 
+#ifdef POINTS
+
 // Where the ray has the sample's depth, within the texel.
-inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
+inline float meet_sample(const Trace *t, const GridRay *r, uint k, uint triangle, Span s)
 {
-    const uint triangle = t->cube->samples.triangle[k];
     float at = s.low;
     if (r->depth_d != 0.0f)
         at = (depth_of(t->cube->samples.near[k]) - r->depth_o) * r->depth_inverse;
     at = at < s.low ? s.low : at > s.high ? s.high : at;
     float distance = at / t->per_t;
     distance = MAX(distance, t->frame.tnear);
-    distance = MIN(distance, t->frame.tfar);
+    return MIN(distance, t->frame.tfar);
+}
+
+#else
+
+// Where the ray meets the triangle's plane, within the texel and the ray's segment; else NaN.
+inline float meet_sample(const Trace *t, const GridRay *r, uint k, uint triangle, Span s)
+{
+    global const float4 *v = t->cube->triangles + TRIANGLE_FLOAT4S * (ulong)triangle;
+    const float4 n = normal_of(v);
+    const float distance = dot3(v[0] - t->org, n) / dot3(t->dir, n), at = distance * t->per_t;
+    const bool meets = at >= s.low && at <= s.high && distance >= t->frame.tnear
+                       && distance <= t->frame.tfar;
+    return meets ? distance : NAN;
+}
+
+#endif
+
+inline void visit_sample(Trace *t, const GridRay *r, uint k, Span s)
+{
+    const uint triangle = t->cube->samples.triangle[k];
     t->tests++;
+    const float distance = meet_sample(t, r, k, triangle, s);
+    if (!(distance >= 0.0f))
+        return;
     const ulong key = hit_key(distance, triangle);
     if (key >= t->nearest || touches(t, triangle))
         return;
@@ -504,19 +538,25 @@ inline void trace_far(Trace *t)
 }
 
 inline Trace start_ray(const Cube *cube, const Grid *grid, float4 org_tnear, float4 dir_tfar,
-                       float tolerance, bool any)
+                       float2 tolerance, bool any)
 {
     Trace t = {cube};
-    t.tolerance = tolerance * grid->diagonal * grid->per_unit;
+    t.tolerance = tolerance.x * grid->diagonal * grid->per_unit + tolerance.y;
     t.frame = ray_frame(org_tnear, dir_tfar);
     t.nearest = MISS;
     t.any = any;
     for (uint k = 0; k < MAILBOX; k++)
         t.tested[k] = INVALID;
 #ifndef CONSERVATIVE
+    t.org = org_tnear;
+    t.dir = dir_tfar;
     t.start = org_tnear + t.frame.tnear * dir_tfar;
     t.stop = t.frame.tfar < MAXFLOAT ? org_tnear + t.frame.tfar * dir_tfar : t.start;
+#ifdef POINTS
     t.margin = t.tolerance / grid->per_unit + grid->edge;
+#else
+    t.margin = grid->edge;
+#endif
 #endif
     aim(&t, grid, org_tnear, dir_tfar);
     return t;
@@ -535,11 +575,11 @@ inline void trace(Trace *t, uint num_rays)
         walk_blocks(t, num_rays, turn);
 }
 
-// Work-item g takes RAYS consecutive rays. counts[3g]: active rays, triangles or samples tested,
-// hits.
+// Work-item g takes RAYS consecutive rays. tolerance: in diagonals and in texels, to be added up.
+// counts[3g]: active rays, triangles or samples tested, hits.
 #define DEFINE_TRACE(NAME, RESULT, ANY, STORE)                                                     \
     kernel void NAME(const uint num_rays, const uint num_triangles, const int resolution,          \
-                     const int2 block, const float tolerance, global const float4 *restrict grid,  \
+                     const int2 block, const float2 tolerance, global const float4 *restrict grid, \
                      global const uint *restrict first, global Depth *restrict near,               \
                      global Depth *restrict far, global uint *restrict triangle,                   \
                      global const ulong *restrict slabs, global const float4 *restrict org_tnear,  \
@@ -575,8 +615,8 @@ inline void trace(Trace *t, uint num_rays)
 DEFINE_TRACE(intersect_ldc, ulong, false, KEY)
 DEFINE_TRACE(occlude_ldc, uchar, true, BLOCKED)
 
-// Hits from keys in the published mode: t is the ray's, u and v are the stored sample's (section
-// 1.4), that of the texel in which the ray then is.
+// Hits from keys of samples: POINTS, t is the ray's, u and v are the stored sample's (section 1.4), that
+// of the texel in which the ray then is; else u and v are those of the ray's point.
 kernel void resolve_samples(const uint num_rays, const int resolution,
                             global const float4 *restrict grid,
                             global const ulong *restrict closest,
@@ -598,7 +638,12 @@ kernel void resolve_samples(const uint num_rays, const int resolution,
         global const float4 *corners = triangles + TRIANGLE_FLOAT4S * (ulong)id;
         const uint axis = axis_of(grid_normal(&g, corners));
         const float4 p = seen_along(axis, to_grid(&g, org_tnear[i] + t[i] * dir_tfar[i]));
-        weights = weights_at(&g, corners, cell_of(p.x, resolution), cell_of(p.y, resolution));
+#ifdef POINTS
+        weights = weights_at(&g, corners, cell_of(p.x, resolution) + 0.5f,
+                             cell_of(p.y, resolution) + 0.5f);
+#else
+        weights = weights_at(&g, corners, p.x, p.y);
+#endif
     }
     triangle[i] = id;
     u[i] = weights.x;

@@ -1,8 +1,9 @@
 """Method `ldc`: rays through the layered depth cube of Buerger et al. (2007), cl/ldc.cl.
 
-As published, a ray hits a sample that it comes close to: image-accurate, fast where triangles are
-small, and blind to what falls between the samples. With ``exact=True`` the triangles of the samples
-that a ray may meet are intersected: hits equal those of `brute`.
+A ray hits samples: image-accurate, fast where triangles are small, and blind to what falls between
+them. As published (``tolerance=0.001``) those that it comes close to; by default those whose piece
+of their triangle's plane, as large as a texel, it meets. With ``exact=True`` the triangles of the
+samples that a ray may meet are intersected: hits equal those of `brute`.
 """
 
 import numpy as np
@@ -16,6 +17,9 @@ from raystream.statistics import FINAL_INTERSECTION, TRAVERSAL, Statistics
 
 _RAYS = 64  # to a work-item
 _LOCAL = 64
+# A triangle's slopes in its image are at most 1 along both sides of a texel.
+_PLANE_REACH = 1.0  # texels that its depth within one is from the sample's, at most
+_HALF_ULP = 2.0**-12  # of a depth of 16 bits
 
 
 class LayeredDepthCubeTracer:
@@ -30,13 +34,15 @@ class LayeredDepthCubeTracer:
     resolution : int
         Texels along each edge of the cube; 512 or 1024 in the paper.
     exact : bool
-        Hits equal those of `brute` bit for bit. Otherwise as published.
-    tolerance : float
-        Published mode: a ray hits a sample whose depth is within this of the ray's depths over
-        the sample's texel. In parts of the diagonal of the scene's bounding box; the paper's 0.001
-        is in the units of its scenes. A surface may be met that much early, and beside its rim. Not
-        hit is the surface on which a ray starts or ends: triangles whose plane is within a texel
-        and the tolerance of org + tnear dir, or org + tfar dir. Not used where `exact`.
+        Hits equal those of `brute` bit for bit. Otherwise those of samples.
+    tolerance : float or None
+        A number: as published, a ray hits a sample whose depth is within this of the ray's depths
+        over the sample's texel, and is shaded from there. In parts of the diagonal of the scene's
+        bounding box; the paper's 0.001 is in the units of its scenes. A surface may be met that
+        much early, and beside its rim. None: a ray hits a sample where it meets the plane of the
+        sample's triangle within its texel. Either way not hit is the surface on which a ray starts
+        or ends: triangles whose plane is within a texel (and the tolerance) of org + tnear dir, or
+        org + tfar dir. Not used where `exact`.
     builder : {"a-buffer", "peeling"}
         How the cube is made: see `LayeredDepthCube`.
     block : int, (int, int) or None
@@ -53,8 +59,8 @@ class LayeredDepthCubeTracer:
 
     Notes
     -----
-    `Statistics.final_tests` counts triangles intersected with a ray (published mode: samples close
-    to it), `final_hits` those hit within the ray's segment as far as it then reached: every hit
+    `Statistics.final_tests` counts triangles intersected with a ray (not `exact`: samples close to
+    it), `final_hits` those hit within the ray's segment as far as it then reached: every hit
     ends it, so these depend on the order of traversal and are fewer than those of `brute`.
     """
 
@@ -65,14 +71,16 @@ class LayeredDepthCubeTracer:
         memory_limit,
         resolution=512,
         exact=False,
-        tolerance=0.001,
+        tolerance=None,
         builder="a-buffer",
         block=16,
         depth="full",
     ):
         check_options(resolution, exact, builder, block, depth)
-        wanted = "a part of the scene's diagonal, at least 0"
-        self.tolerance = check_number("tolerance", tolerance, lambda x: x >= 0, wanted)
+        if tolerance is not None:
+            wanted = "a part of the scene's diagonal, at least 0"
+            tolerance = check_number("tolerance", tolerance, lambda x: x >= 0, wanted)
+        self.tolerance = tolerance
         self.session, self.geometry = session, geometry
         self._options = (memory_limit, resolution, exact, builder, block, depth)
         self._cube, self._version = None, None
@@ -104,7 +112,6 @@ class LayeredDepthCubeTracer:
     def _trace(self, cube, kernel, rays, result):
         groups = -(-len(rays) // _RAYS)
         counts = self.session.empty((groups, 3), np.uint64)
-        tolerance = 0.0 if cube.exact else self.tolerance
         self.session.launch(
             TRAVERSAL,
             self._kernels(cube)[kernel],
@@ -113,7 +120,7 @@ class LayeredDepthCubeTracer:
             np.uint32(self.geometry.num_triangles),
             np.int32(cube.resolution),
             cltypes.make_int2(*cube.block),
-            np.float32(tolerance),
+            cltypes.make_float2(*self._reach(cube)),
             cube.grid,
             cube.first,
             cube.samples.near,
@@ -159,4 +166,14 @@ class LayeredDepthCubeTracer:
         return hits
 
     def _kernels(self, cube):
-        return self.session.kernels("ldc.cl", RAYS=_RAYS, **cube.defines())
+        points = {} if self.tolerance is None or cube.exact else {"POINTS": 1}
+        return self.session.kernels("ldc.cl", RAYS=_RAYS, **points, **cube.defines())
+
+    def _reach(self, cube):
+        """How far from a ray's depths a sample's may be: in diagonals of the scene, in texels."""
+        if cube.exact:
+            return 0.0, 0.0
+        if self.tolerance is not None:
+            return self.tolerance, 0.0
+        rounding = cube.resolution * _HALF_ULP if cube.depth == "half" else 0.0
+        return 0.0, _PLANE_REACH + rounding
