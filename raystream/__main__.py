@@ -29,6 +29,9 @@ PROCEDURAL = {
     "gears": scenes.gears,
     "balls": scenes.balls,
     "mountain": scenes.mountain,
+    "room": scenes.room,
+    "toys": scenes.toys,
+    "meadow": scenes.meadow,
 }
 _VECTOR_OPTIONS = ("--eye", "--target", "--up", "--light", "--mirror-ball")
 _BAD_INPUT = 2
