@@ -6,7 +6,7 @@ from raystream.errors import DeviceError
 from raystream.statistics import HIERARCHY_CREATION
 
 _NUM_BINS = 16
-_LEAF_SIZE = 8  # leaves hold at most this many triangles; fewer where the SAH says so
+LEAF_SIZE = 8  # leaves hold at most this many triangles; fewer where the SAH says so
 _BUILDERS = 64  # work-items that split the nodes of a level
 _LOCAL = 64
 
@@ -42,7 +42,7 @@ class Bvh:
         if "cl_khr_fp64" not in session.device.extensions:
             raise DeviceError(f"{session.device.name}: need double precision (cl_khr_fp64)")
         self.session, count = session, geometry.num_triangles
-        self._kernels = session.kernels("bvh.cl", NUM_BINS=_NUM_BINS, LEAF_SIZE=_LEAF_SIZE)
+        self._kernels = session.kernels("bvh.cl", NUM_BINS=_NUM_BINS, LEAF_SIZE=LEAF_SIZE)
         self.nodes = session.empty((2 * count, 8), np.float32)
         self.order = session.empty(count, np.uint32)
         self.triangles = session.empty((count, 12), np.float32)
