@@ -305,6 +305,10 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
             if (p.count == 0)                                                                      \
                 continue;                                                                          \
             p.frustum.valid = false;                                                               \
+            if (culling)                                                                           \
+                bound_packet(&p.frustum, p.rays, p.count, p.direction,                             \
+                             width != 0 && p.count == packet_side * packet_side ? packet_side : 0, \
+                             root.low, root.high);                                                 \
             traverse(&p, traversal, nodes, triangles, ANY_HIT, counters);                          \
             packets++;                                                                             \
             simd_rays += p.count;                                                                  \

@@ -201,7 +201,7 @@ inline void intersect_triangles(SimdRay *r, const uint *slots, uint count,
 }
 
 // Fills the rows from the rays of the lanes; lanes that are not live never hit.
-inline void set_up(SimdRay *r, VF *origin, VF *direction, VF tnear, VF tfar, VI live, float size)
+inline void set_up(SimdRay *r, const VF *origin, const VF *direction, VF tnear, VF tfar, VI live, float size)
 {
     VF d[3], most = 0.0f;
     for (uint axis = 0; axis < 3; axis++) {
