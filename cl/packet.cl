@@ -37,6 +37,7 @@ typedef struct {
     uint count;
     float direction[3]; // sum of unit directions
     Frustum frustum;
+    uint least_saved; // the frustum is asked where a cull saves so many tests of SIMD rays
     uchar indices[MAX_SIMD]; // Partition: the places of SIMD rays, the alive ones in front
     uchar active[MAX_SIMD];  // at a leaf
     uint num_active;
@@ -104,10 +105,11 @@ inline void load_packet(Packet *p, const Stream *s, uint packet, float size)
 
 #define COUNT(what, amount) counters[depth][what] += (amount)
 
-inline bool frustum_meets(const Packet *p, float4 low, float4 high, ulong (*counters)[NUM_COUNTERS],
-                          uint depth)
+// `saved`: how many tests of SIMD rays a cull saves.
+inline bool frustum_meets(const Packet *p, float4 low, float4 high, uint saved,
+                          ulong (*counters)[NUM_COUNTERS], uint depth)
 {
-    if (!p->frustum.valid)
+    if (!p->frustum.valid || saved < p->least_saved)
         return true;
     COUNT(FRUSTUM_BOX_TESTS, 1);
     const bool culled = frustum_culls_box(&p->frustum, low, high);
@@ -118,7 +120,7 @@ inline bool frustum_meets(const Packet *p, float4 low, float4 high, ulong (*coun
 // Masked, figure 2, lines 7 to 13: an inner cell is tested up to the first hit, a leaf by all.
 inline bool enter_masked(Packet *p, const Node *cell, ulong (*counters)[NUM_COUNTERS], uint depth)
 {
-    if (!frustum_meets(p, cell->low, cell->high, counters, depth))
+    if (!frustum_meets(p, cell->low, cell->high, p->count, counters, depth))
         return false;
     p->num_active = 0;
     for (uint i = 0; i < p->count; i++) {
@@ -140,7 +142,7 @@ inline uint first_hit(const Packet *p, const Node *cell, uint ia, ulong (*counte
     uint i = ia;
     COUNT(BOX_TESTS, 1);
     if (!meet(p->rays + ia, cell->low, cell->high)) {
-        if (!frustum_meets(p, cell->low, cell->high, counters, depth))
+        if (!frustum_meets(p, cell->low, cell->high, p->count - ia - 1, counters, depth))
             return p->count;
         for (i = ia + 1; i < p->count; i++) {
             COUNT(BOX_TESTS, 1);
@@ -173,7 +175,7 @@ inline void activate_range(Packet *p, const Node *cell, uint ia, ulong (*counter
 inline uint partition_rays(Packet *p, const Node *cell, uint ia, ulong (*counters)[NUM_COUNTERS],
                            uint depth)
 {
-    if (!frustum_meets(p, cell->low, cell->high, counters, depth))
+    if (!frustum_meets(p, cell->low, cell->high, ia, counters, depth))
         return 0;
     uint ie = 0;
     for (uint i = 0; i < ia; i++) {
@@ -204,7 +206,7 @@ inline void visit_leaf(Packet *p, const Node *cell, const uchar *active, uint nu
 {
     uint slots[LEAF_SIZE], count = 0;
     for (uint k = LEAF_FIRST(*cell); k < LEAF_FIRST(*cell) + LEAF_COUNT(*cell); k++) {
-        if (p->frustum.valid) {
+        if (p->frustum.valid && num_active >= p->least_saved) {
             COUNT(FRUSTUM_TRIANGLE_TESTS, 1);
             if (frustum_culls_triangle(&p->frustum, triangles + TRIANGLE_FLOAT4S * (ulong)k)) {
                 COUNT(FRUSTUM_TRIANGLE_CULLS, 1);
@@ -278,7 +280,7 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
 #define DEFINE_PACKET_KERNEL(NAME, RESULT, NONE, ANY_HIT, FOUND)                                   \
     kernel void NAME(const uint num_packets, const uint num_rays, const uint width,                \
                      const uint height, const uint packet_side, const uint traversal,              \
-                     const uint culling, const uint num_levels, global const Node *restrict nodes, \
+                     const uint least_saved, const uint num_levels, global const Node *restrict nodes, \
                      global const float4 *restrict triangles,                                      \
                      global const float4 *restrict org_tnear,                                      \
                      global const float4 *restrict dir_tfar, global RESULT *restrict result,       \
@@ -305,7 +307,8 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
             if (p.count == 0)                                                                      \
                 continue;                                                                          \
             p.frustum.valid = false;                                                               \
-            if (culling)                                                                           \
+            p.least_saved = least_saved;                                                           \
+            if (least_saved)                                                                         \
                 bound_packet(&p.frustum, p.rays, p.count, p.direction,                             \
                              width != 0 && p.count == packet_side * packet_side ? packet_side : 0, \
                              root.low, root.high);                                                 \

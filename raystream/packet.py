@@ -60,6 +60,7 @@ class PacketTracer:
         packet_size=16,
         frustum_culling=True,
         simd_width=None,
+        least_saved=1,
     ):
         check_choice("traversal", traversal, TRAVERSALS)
         check_choice("packet_size", packet_size, PACKET_SIZES)
@@ -71,6 +72,7 @@ class PacketTracer:
         self._limit, self._traversal, self._packet_size = memory_limit, traversal, packet_size
         self._culling, self._simd_width = frustum_culling, simd_width
         self._bvh, self._version = None, None
+        self._least_saved = least_saved
 
     def bvh(self):
         """The `Bvh` of the geometry as it is now."""
@@ -107,7 +109,7 @@ class PacketTracer:
             np.uint32(height),
             np.uint32(size // math.isqrt(self._simd_width)),
             np.uint32(TRAVERSALS.index(self._traversal)),
-            np.uint32(self._culling),
+            np.uint32(self._least_saved if self._culling else 0),
             np.uint32(bvh.num_levels),
             bvh.nodes,
             bvh.triangles,
