@@ -37,7 +37,7 @@ typedef struct {
     uint count;
     float direction[3]; // sum of unit directions
     Frustum frustum;
-    uint least_saved; // the frustum is asked where a cull saves so many tests of SIMD rays
+    uint least_active; // the frustum is asked where so many SIMD rays are active
     uchar indices[MAX_SIMD]; // Partition: the places of SIMD rays, the alive ones in front
     uchar active[MAX_SIMD];  // at a leaf
     uint num_active;
@@ -105,11 +105,11 @@ inline void load_packet(Packet *p, const Stream *s, uint packet, float size)
 
 #define COUNT(what, amount) counters[depth][what] += (amount)
 
-// `saved`: how many tests of SIMD rays a cull saves.
-inline bool frustum_meets(const Packet *p, float4 low, float4 high, uint saved,
+// Whether a packet with so many active rays may overlap a box.
+inline bool frustum_meets(const Packet *p, float4 low, float4 high, uint active,
                           ulong (*counters)[NUM_COUNTERS], uint depth)
 {
-    if (!p->frustum.valid || saved < p->least_saved)
+    if (!p->frustum.valid || active < p->least_active)
         return true;
     COUNT(FRUSTUM_BOX_TESTS, 1);
     const bool culled = frustum_culls_box(&p->frustum, low, high);
@@ -142,7 +142,7 @@ inline uint first_hit(const Packet *p, const Node *cell, uint ia, ulong (*counte
     uint i = ia;
     COUNT(BOX_TESTS, 1);
     if (!meet(p->rays + ia, cell->low, cell->high)) {
-        if (!frustum_meets(p, cell->low, cell->high, p->count - ia - 1, counters, depth))
+        if (!frustum_meets(p, cell->low, cell->high, p->count - ia, counters, depth))
             return p->count;
         for (i = ia + 1; i < p->count; i++) {
             COUNT(BOX_TESTS, 1);
@@ -206,7 +206,7 @@ inline void visit_leaf(Packet *p, const Node *cell, const uchar *active, uint nu
 {
     uint slots[LEAF_SIZE], count = 0;
     for (uint k = LEAF_FIRST(*cell); k < LEAF_FIRST(*cell) + LEAF_COUNT(*cell); k++) {
-        if (p->frustum.valid && num_active >= p->least_saved) {
+        if (p->frustum.valid && num_active >= p->least_active) {
             COUNT(FRUSTUM_TRIANGLE_TESTS, 1);
             if (frustum_culls_triangle(&p->frustum, triangles + TRIANGLE_FLOAT4S * (ulong)k)) {
                 COUNT(FRUSTUM_TRIANGLE_CULLS, 1);
@@ -225,7 +225,8 @@ inline void visit_leaf(Packet *p, const Node *cell, const uchar *active, uint nu
 #endif
         intersect_triangles(r, slots, count, triangles);
         const VI hit = r->triangle != INVALID;
-        const VF closest = any_hit ? (VF)-INFINITY : r->t * r->largest;
+        // The next number: distances may be so small that they round to 0.
+        const VF closest = any_hit ? (VF)-INFINITY : AS_VF(AS_VI(r->t) + 1) * r->largest;
         r->leave = hit ? closest : r->leave;
     }
 }
@@ -280,7 +281,7 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
 #define DEFINE_PACKET_KERNEL(NAME, RESULT, NONE, ANY_HIT, FOUND)                                   \
     kernel void NAME(const uint num_packets, const uint num_rays, const uint width,                \
                      const uint height, const uint packet_side, const uint traversal,              \
-                     const uint least_saved, const uint num_levels, global const Node *restrict nodes, \
+                     const uint least_active, const uint num_levels, global const Node *restrict nodes, \
                      global const float4 *restrict triangles,                                      \
                      global const float4 *restrict org_tnear,                                      \
                      global const float4 *restrict dir_tfar, global RESULT *restrict result,       \
@@ -307,8 +308,8 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
             if (p.count == 0)                                                                      \
                 continue;                                                                          \
             p.frustum.valid = false;                                                               \
-            p.least_saved = least_saved;                                                           \
-            if (least_saved)                                                                         \
+            p.least_active = least_active;                                                           \
+            if (least_active)                                                                         \
                 bound_packet(&p.frustum, p.rays, p.count, p.direction,                             \
                              width != 0 && p.count == packet_side * packet_side ? packet_side : 0, \
                              root.low, root.high);                                                 \

@@ -15,6 +15,8 @@ typedef uint16 VU;
 typedef RayFrame16 VFrame;
 typedef TriangleHit16 VHit;
 #define SIDE 4 // of the square of pixels that a SIMD ray covers
+#define AS_VF as_float16
+#define AS_VI as_int16
 #define FMA_V(a, b, c) FMA16(a, b, c)
 #define MASK_V(m) MASK16(m)
 #define INSIDE_EDGES inside_edges16
@@ -35,6 +37,8 @@ typedef uint4 VU;
 typedef RayFrame4 VFrame;
 typedef TriangleHit4 VHit;
 #define SIDE 2
+#define AS_VF as_float4
+#define AS_VI as_int4
 #define FMA_V(a, b, c) FMA4(a, b, c)
 #define MASK_V(m) MASK4(m)
 #define INSIDE_EDGES inside_edges4

@@ -60,7 +60,7 @@ class PacketTracer:
         packet_size=16,
         frustum_culling=True,
         simd_width=None,
-        least_saved=1,
+        least_active=1,
     ):
         check_choice("traversal", traversal, TRAVERSALS)
         check_choice("packet_size", packet_size, PACKET_SIZES)
@@ -72,7 +72,7 @@ class PacketTracer:
         self._limit, self._traversal, self._packet_size = memory_limit, traversal, packet_size
         self._culling, self._simd_width = frustum_culling, simd_width
         self._bvh, self._version = None, None
-        self._least_saved = least_saved
+        self._least_active = least_active
 
     def bvh(self):
         """The `Bvh` of the geometry as it is now."""
@@ -109,7 +109,7 @@ class PacketTracer:
             np.uint32(height),
             np.uint32(size // math.isqrt(self._simd_width)),
             np.uint32(TRAVERSALS.index(self._traversal)),
-            np.uint32(self._least_saved if self._culling else 0),
+            np.uint32(self._least_active if self._culling else 0),
             np.uint32(bvh.num_levels),
             bvh.nodes,
             bvh.triangles,
@@ -123,6 +123,7 @@ class PacketTracer:
 
     def _statistics(self, bvh, totals, counts):
         by_depth = {name: counts[:, k].tolist() for k, name in enumerate(COUNTERS)}
+        self.by_depth = by_depth
         rays, _, _, hits = (int(x) for x in totals)
         levels = [
             {"nodes": nodes, "tests": tests, "hits": hits, "misses": tests - hits}
