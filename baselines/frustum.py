@@ -332,7 +332,8 @@ def near_far_frusta(rays, axes, scene):
     normals, offsets = _side_planes(at_near, at_far, near, far, pad)
     starts, stops = _rectangle(at_near, near), _rectangle(at_far, far)
     directions = stops - starts
-    valid = (rays.least(d[..., 2]) >= MIN_ADVANCE) & (size >= SMALLEST_SIZE) & (size <= LARGEST_SIZE)
+    valid = (size >= SMALLEST_SIZE) & (size <= LARGEST_SIZE)
+    valid &= rays.least(d[..., 2]) >= MIN_ADVANCE
     return Frusta(
         valid=valid,
         shared=(lows == highs).all(axis=1),

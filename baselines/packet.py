@@ -320,8 +320,9 @@ class _Packets:
         """
         side, width = packet_size // simd_side, simd_side * simd_side
         simd = np.array([0, side - 1, side * side - 1, side * (side - 1)])
-        corners = width * (self.first[:, None] + simd) + [0, simd_side - 1, width - 1, width - simd_side]
-        return np.where((self.count == side * side)[:, None], corners, -1)
+        lanes = np.array([0, simd_side - 1, width - 1, width - simd_side])
+        whole = (self.count == side * side)[:, None]
+        return np.where(whole, width * (self.first[:, None] + simd) + lanes, -1)
 
 
 def _screen_places(num_rays, packet_size, simd_side, size, pixels):

@@ -220,9 +220,7 @@ inline void visit_leaf(Packet *p, const Node *cell, const uchar *active, uint nu
     COUNT(TRIANGLE_TESTS, num_active * count);
     for (uint i = 0; i < num_active; i++) {
         SimdRay *r = p->rays + active[i];
-#ifdef COUNT_ALIVE
         COUNT(ALIVE, meet(r, cell->low, cell->high) != 0);
-#endif
         intersect_triangles(r, slots, count, triangles);
         const VI hit = r->triangle != INVALID;
         // The next number: distances may be so small that they round to 0.
