@@ -37,7 +37,7 @@ typedef struct {
     uint count;
     float direction[3]; // sum of unit directions
     Frustum frustum;
-    uint least_active; // the frustum is asked where so many SIMD rays are active
+    uint least_active; // the frustum is asked where so many SIMD rays are; 0: never
     uchar indices[MAX_SIMD]; // Partition: the places of SIMD rays, the alive ones in front
     uchar active[MAX_SIMD];  // at a leaf
     uint num_active;
@@ -50,57 +50,61 @@ typedef struct {
     global const float4 *org_tnear, *dir_tfar;
 } Stream;
 
-// The ray in a lane of the SIMD ray at a place of a packet; INVALID where there is none.
-inline uint ray_at(const Stream *s, uint packet, uint place, uint lane)
+// The rays in the lanes of the SIMD ray at a place of a packet; INVALID where there is none.
+inline VU rays_at(const Stream *s, uint packet, uint place)
 {
     if (s->width == 0) {
-        const ulong ray = ((ulong)packet * s->packet_side * s->packet_side + place) * WIDTH + lane;
-        return ray < s->num_rays ? (uint)ray : INVALID;
+        const ulong first = ((ulong)packet * s->packet_side * s->packet_side + place) * WIDTH;
+        const VU ray = (uint)first + LANES;
+        return first + WIDTH <= s->num_rays ? ray : (ray < s->num_rays ? ray : (VU)INVALID);
     }
     const uint size = s->packet_side * SIDE, tiles = (s->width + size - 1) / size;
-    const uint x = packet % tiles * size + place % s->packet_side * SIDE + lane % SIDE;
-    const uint y = packet / tiles * size + place / s->packet_side * SIDE + lane / SIDE;
-    return x < s->width && y < s->height ? y * s->width + x : INVALID;
+    const uint row = place / s->packet_side;
+    const VU x = packet % tiles * size + (place - row * s->packet_side) * SIDE + (LANES & (SIDE - 1));
+    const VU y = packet / tiles * size + row * SIDE + LANES / SIDE;
+    return ((x < s->width) & (y < s->height)) ? y * s->width + x : (VU)INVALID;
 }
 
-// Loads the SIMD ray at a place of a packet.
-inline void load_simd_ray(const Stream *s, uint packet, uint place, float size, SimdRay *r)
+// Loads the SIMD ray at a place of a packet; false, and only its rays are set, if no lane is live.
+inline bool load_simd_ray(const Stream *s, uint packet, uint place, float size, SimdRay *r)
 {
-    float lanes[8][WIDTH] __attribute__((aligned(64)));
+    r->ray = rays_at(s, packet, place);
+    r->triangle = INVALID;
     uint rays[WIDTH] __attribute__((aligned(64)));
+    *(VU *)rays = r->ray;
+    float4 origins[WIDTH] __attribute__((aligned(64)));
+    float4 directions[WIDTH] __attribute__((aligned(64)));
     for (uint lane = 0; lane < WIDTH; lane++) {
-        const uint ray = ray_at(s, packet, place, lane);
-        const float4 o = s->org_tnear[ray == INVALID ? 0 : ray];
-        const float4 d = s->dir_tfar[ray == INVALID ? 0 : ray];
-        const float fields[8] = {o.x, o.y, o.z, o.w, d.x, d.y, d.z, d.w};
-        for (uint k = 0; k < 8; k++)
-            lanes[k][lane] = fields[k];
-        rays[lane] = ray;
+        const uint ray = rays[lane] == INVALID ? 0 : rays[lane];
+        origins[lane] = s->org_tnear[ray];
+        directions[lane] = s->dir_tfar[ray];
     }
-    const VF *v = (const VF *)lanes;
-    r->ray = *(VU *)rays;
-    const VI live = (r->ray != INVALID) & (v[7] >= v[3])
-                    & ((v[4] != 0.0f) | (v[5] != 0.0f) | (v[6] != 0.0f));
-    set_up(r, v, v + 4, v[3], v[7], live, size);
+    VF o[3], d[3], tnear, tfar;
+    TRANSPOSE(origins, o[0], o[1], o[2], tnear)
+    TRANSPOSE(directions, d[0], d[1], d[2], tfar)
+    const VI live = (r->ray != INVALID) & (tfar >= tnear)
+                    & ((d[0] != 0.0f) | (d[1] != 0.0f) | (d[2] != 0.0f));
+    r->live = MASK_V(live);
+    if (r->live == 0)
+        return false;
+    set_up(r, o, d, tnear, tfar, live, size);
+    return true;
 }
 
-inline void load_packet(Packet *p, const Stream *s, uint packet, float size)
+// What is common to the rays of a packet: order of children, frustum, first order of the rays.
+inline void prepare(Packet *p, uint side, float4 scene_low, float4 scene_high)
 {
-    p->count = 0;
     VF total[3] = {0.0f, 0.0f, 0.0f};
-    for (uint place = 0; place < s->packet_side * s->packet_side; place++) {
-        SimdRay *r = p->rays + p->count;
-        load_simd_ray(s, packet, place, size, r);
-        if (r->live == 0)
-            continue;
-        const VI live = r->leave > -INFINITY;
+    for (uint i = 0; i < p->count; i++) {
         for (uint axis = 0; axis < 3; axis++)
-            total[axis] += CHOOSE(live, r->unit[axis], 0.0f);
-        p->indices[p->count] = p->count;
-        p->count++;
+            total[axis] += CHOOSE(live_lanes(p->rays + i), p->rays[i].unit[axis], 0.0f);
+        p->indices[i] = i;
     }
     for (uint axis = 0; axis < 3; axis++)
         p->direction[axis] = sum_lanes(total[axis]);
+    p->frustum.valid = false;
+    if (p->least_active)
+        bound_packet(&p->frustum, p->rays, p->count, p->direction, side, scene_low, scene_high);
 }
 
 #define COUNT(what, amount) counters[depth][what] += (amount)
@@ -277,55 +281,55 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
 // Work-item g takes the packets g, g + global size, ...; totals[g] are its rays, SIMD rays, packets and
 // rays that hit, counts[g] what it counted by depth.
 #define DEFINE_PACKET_KERNEL(NAME, RESULT, NONE, ANY_HIT, FOUND)                                   \
+    inline void store##NAME(const SimdRay *r, global RESULT *result)                               \
+    {                                                                                              \
+        float t[WIDTH] __attribute__((aligned(64)));                                               \
+        uint id[WIDTH] __attribute__((aligned(64))), ray[WIDTH] __attribute__((aligned(64)));      \
+        *(VF *)t = r->t, *(VU *)id = r->triangle, *(VU *)ray = r->ray;                             \
+        for (uint lane = 0; lane < WIDTH; lane++)                                                  \
+            if (ray[lane] != INVALID)                                                              \
+                result[ray[lane]] = id[lane] == INVALID ? (RESULT)NONE : (RESULT)FOUND;            \
+    }                                                                                              \
+                                                                                                   \
     kernel void NAME(const uint num_packets, const uint num_rays, const uint width,                \
                      const uint height, const uint packet_side, const uint traversal,              \
-                     const uint least_active, const uint num_levels, global const Node *restrict nodes, \
-                     global const float4 *restrict triangles,                                      \
+                     const uint least_active, const uint num_levels,                               \
+                     global const Node *restrict nodes, global const float4 *restrict triangles,   \
                      global const float4 *restrict org_tnear,                                      \
                      global const float4 *restrict dir_tfar, global RESULT *restrict result,       \
                      global ulong *restrict totals, global ulong *restrict counts)                 \
     {                                                                                              \
         const Stream stream = {num_rays, width, height, packet_side, org_tnear, dir_tfar};         \
         const Node root = nodes[0];                                                                \
-        const float size = box_size(root.low, root.high);                                          \
         ulong counters[DEPTH][NUM_COUNTERS];                                                       \
         for (uint depth = 0; depth < num_levels; depth++)                                          \
             for (uint k = 0; k < NUM_COUNTERS; k++)                                                \
                 counters[depth][k] = 0;                                                            \
         ulong rays = 0, simd_rays = 0, packets = 0, hits = 0;                                      \
         Packet p;                                                                                  \
+        p.least_active = least_active;                                                             \
         for (uint packet = get_global_id(0); packet < num_packets;                                 \
              packet += get_global_size(0)) {                                                       \
-            for (uint place = 0; place < packet_side * packet_side; place++)                       \
-                for (uint lane = 0; lane < WIDTH; lane++) {                                        \
-                    const uint ray = ray_at(&stream, packet, place, lane);                         \
-                    if (ray != INVALID)                                                            \
-                        result[ray] = NONE;                                                        \
-                }                                                                                  \
-            load_packet(&p, &stream, packet, size);                                                \
+            p.count = 0;                                                                           \
+            for (uint place = 0; place < packet_side * packet_side; place++) {                     \
+                SimdRay *r = p.rays + p.count;                                                     \
+                if (load_simd_ray(&stream, packet, place, box_size(root.low, root.high), r))       \
+                    p.count++;                                                                     \
+                else                                                                               \
+                    store##NAME(r, result);                                                        \
+            }                                                                                      \
             if (p.count == 0)                                                                      \
                 continue;                                                                          \
-            p.frustum.valid = false;                                                               \
-            p.least_active = least_active;                                                           \
-            if (least_active)                                                                         \
-                bound_packet(&p.frustum, p.rays, p.count, p.direction,                             \
-                             width != 0 && p.count == packet_side * packet_side ? packet_side : 0, \
-                             root.low, root.high);                                                 \
+            prepare(&p, width != 0 && p.count == packet_side * packet_side ? packet_side : 0,      \
+                    root.low, root.high);                                                          \
             traverse(&p, traversal, nodes, triangles, ANY_HIT, counters);                          \
             packets++;                                                                             \
             simd_rays += p.count;                                                                  \
             for (uint i = 0; i < p.count; i++) {                                                   \
                 const SimdRay *r = p.rays + i;                                                     \
                 rays += COUNT16(r->live);                                                          \
-                float t[WIDTH] __attribute__((aligned(64)));                                       \
-                uint id[WIDTH] __attribute__((aligned(64))),                                       \
-                    ray[WIDTH] __attribute__((aligned(64)));                                       \
-                *(VF *)t = r->t, *(VU *)id = r->triangle, *(VU *)ray = r->ray;                     \
-                for (uint found = MASK_V(r->triangle != INVALID); found; found &= found - 1) {     \
-                    const uint lane = LOWEST(found);                                               \
-                    hits++;                                                                        \
-                    result[ray[lane]] = FOUND;                                                     \
-                }                                                                                  \
+                hits += COUNT16(MASK_V(r->triangle != INVALID));                                   \
+                store##NAME(r, result);                                                            \
             }                                                                                      \
         }                                                                                          \
         global ulong *mine = totals + 4 * (ulong)get_global_id(0);                                 \

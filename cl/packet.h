@@ -14,6 +14,8 @@ typedef int16 VI;
 typedef uint16 VU;
 typedef RayFrame16 VFrame;
 typedef TriangleHit16 VHit;
+#define LANES (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#define TRANSPOSE(s, x, y, z, w) TRANSPOSE16(s, x, y, z, w)
 #define SIDE 4 // of the square of pixels that a SIMD ray covers
 #define AS_VF as_float16
 #define AS_VI as_int16
@@ -36,6 +38,12 @@ typedef int4 VI;
 typedef uint4 VU;
 typedef RayFrame4 VFrame;
 typedef TriangleHit4 VHit;
+#define LANES (uint4)(0, 1, 2, 3)
+#define TRANSPOSE(s, to_x, to_y, to_z, to_w)                                                       \
+    to_x = (float4)(s[0].x, s[1].x, s[2].x, s[3].x);                                               \
+    to_y = (float4)(s[0].y, s[1].y, s[2].y, s[3].y);                                               \
+    to_z = (float4)(s[0].z, s[1].z, s[2].z, s[3].z);                                               \
+    to_w = (float4)(s[0].w, s[1].w, s[2].w, s[3].w);
 #define SIDE 2
 #define AS_VF as_float4
 #define AS_VI as_int4
@@ -222,7 +230,6 @@ inline void set_up(SimdRay *r, const VF *origin, const VF *direction, VF tnear, 
     r->shear[1] = -((along_x ? d[2] : (along_y ? d[0] : d[1])) / m);
     r->scale = 1.0f / m;
     r->major = along_x ? (VI)0 : (along_y ? (VI)1 : (VI)2);
-    r->live = MASK_V(live);
     r->axis = MIXED;
     for (uint axis = 0; axis < 3; axis++)
         r->axis = MASK_V(live & (r->major != (int)axis)) == 0 ? axis : r->axis;
@@ -240,5 +247,4 @@ inline void set_up(SimdRay *r, const VF *origin, const VF *direction, VF tnear, 
     r->enter = r->tnear * r->largest;
     r->leave = CHOOSE(live, tfar * r->largest, -INFINITY);
     r->t = INFINITY;
-    r->triangle = INVALID;
 }
