@@ -2,13 +2,15 @@
 
 import numpy as np
 
-from raystream.errors import DeviceError
+from raystream.errors import DeviceError, MemoryLimitError
 from raystream.statistics import HIERARCHY_CREATION
 
 _NUM_BINS = 16
 LEAF_SIZE = 8  # leaves hold at most this many triangles; fewer where the SAH says so
 _BUILDERS = 64  # work-items that split the nodes of a level
 _LOCAL = 64
+# Of a triangle, while the tree is built: two nodes, their spans, number and scratch, box, corners.
+_BYTES = 2 * 32 + 2 * 16 + 2 * 4 + 32 + 48
 
 
 class Bvh:
@@ -19,6 +21,8 @@ class Bvh:
     session : raystream.device.Session
     geometry : raystream.geometry.Geometry
         With at least one triangle.
+    memory_limit : int
+        Bytes that the tree may take while it is built.
 
     Attributes
     ----------
@@ -34,14 +38,21 @@ class Bvh:
 
     Raises
     ------
+    raystream.errors.MemoryLimitError
+        The tree needs more than `memory_limit`.
     raystream.errors.DeviceError
         The device has no double precision, in which splits are priced.
     """
 
-    def __init__(self, session, geometry):
+    def __init__(self, session, geometry, memory_limit):
         if "cl_khr_fp64" not in session.device.extensions:
             raise DeviceError(f"{session.device.name}: need double precision (cl_khr_fp64)")
         self.session, count = session, geometry.num_triangles
+        if _BYTES * count > memory_limit:
+            raise MemoryLimitError(
+                f"hierarchy of {count} triangles: need {_BYTES * count} bytes, "
+                f"memory_limit is {memory_limit}"
+            )
         self._kernels = session.kernels("bvh.cl", NUM_BINS=_NUM_BINS, LEAF_SIZE=LEAF_SIZE)
         self.nodes = session.empty((2 * count, 8), np.float32)
         self.order = session.empty(count, np.uint32)
@@ -75,6 +86,4 @@ class Bvh:
         return num_levels, end
 
     def _launch(self, name, size, *arguments):
-        self.session.launch(
-            HIERARCHY_CREATION, self._kernels[name], size, *arguments, local=_LOCAL
-        )
+        self.session.launch(HIERARCHY_CREATION, self._kernels[name], size, *arguments, local=_LOCAL)

@@ -9,7 +9,7 @@ import numpy as np
 
 from raystream import intersect
 from raystream.bvh import LEAF_SIZE, Bvh
-from raystream.checks import check_choice
+from raystream.checks import check_choice, check_count
 from raystream.statistics import TRAVERSAL, Statistics
 
 TRAVERSALS = ("masked", "ranged", "partition")
@@ -41,7 +41,9 @@ class PacketTracer:
     geometry : raystream.geometry.Geometry
     memory_limit : int
         Bytes that the hierarchy may take.
-    traversal : {"masked", "ranged", "partition"}
+    traversal : {"auto", "masked", "ranged", "partition"}
+        "auto": Ranged for rays that start in one point, of a camera or a light, Partition for all
+        others (section 6).
     packet_size : {2, 4, 8, 16, 32}
         Rays along a side of a packet: tiles of the screen where the rays have one, else
         packet_size squared consecutive rays.
@@ -49,6 +51,24 @@ class PacketTracer:
     simd_width : {4, 16}, optional
         Rays to a SIMD ray, the smallest primitive: 2 x 2 or 4 x 4 pixels. Default: 16, but 4 for
         packets of 2 x 2.
+    least_active : int
+        A frustum is asked where at least so many SIMD rays are active; 1: always, as in the paper.
+
+    Raises
+    ------
+    ValueError
+        An option that there is not.
+    raystream.errors.MemoryLimitError
+        At the first ray traced: the hierarchy would take more than `memory_limit`.
+    raystream.errors.DeviceError
+        At the first ray traced: see `Bvh`.
+
+    Notes
+    -----
+    Tests are those of SIMD rays, however many of their rays are alive: in `Statistics.levels`
+    (by depth, the root first: `nodes` are visits of packets, `tests` and `hits` of boxes), in
+    `Statistics.final_tests` and in `Statistics.by_depth`. `Statistics.final_hits` are rays that
+    hit. The counts are those of `raystream.baselines.PacketTracer` with precision="single".
     """
 
     def __init__(
@@ -56,13 +76,13 @@ class PacketTracer:
         session,
         geometry,
         memory_limit,
-        traversal="partition",
+        traversal="auto",
         packet_size=16,
         frustum_culling=True,
         simd_width=None,
-        least_active=1,
+        least_active=6,
     ):
-        check_choice("traversal", traversal, TRAVERSALS)
+        check_choice("traversal", traversal, ("auto", *TRAVERSALS))
         check_choice("packet_size", packet_size, PACKET_SIZES)
         check_choice("frustum_culling", frustum_culling, (False, True))
         if simd_width is None:
@@ -71,13 +91,14 @@ class PacketTracer:
         self.session, self.geometry = session, geometry
         self._limit, self._traversal, self._packet_size = memory_limit, traversal, packet_size
         self._culling, self._simd_width = frustum_culling, simd_width
+        self._least_active = check_count("least_active", least_active)
         self._bvh, self._version = None, None
-        self._least_active = least_active
 
     def bvh(self):
         """The `Bvh` of the geometry as it is now."""
         if self._version != self.geometry.version:
-            self._bvh = Bvh(self.session, self.geometry)
+            self._bvh = None  # its memory may be needed
+            self._bvh = Bvh(self.session, self.geometry, self._limit)
             self._version = self.geometry.version
         return self._bvh
 
@@ -108,7 +129,7 @@ class PacketTracer:
             np.uint32(width),
             np.uint32(height),
             np.uint32(size // math.isqrt(self._simd_width)),
-            np.uint32(TRAVERSALS.index(self._traversal)),
+            np.uint32(TRAVERSALS.index(self._traversal_of(rays))),
             np.uint32(self._least_active if self._culling else 0),
             np.uint32(bvh.num_levels),
             bvh.nodes,
@@ -121,10 +142,14 @@ class PacketTracer:
         )
         return self._statistics(bvh, totals.get().sum(axis=0), counts.get().sum(axis=0))
 
+    def _traversal_of(self, rays):
+        if self._traversal != "auto":
+            return self._traversal
+        return "ranged" if rays.primary or rays.light is not None else "partition"
+
     def _statistics(self, bvh, totals, counts):
         by_depth = {name: counts[:, k].tolist() for k, name in enumerate(COUNTERS)}
-        self.by_depth = by_depth
-        rays, _, _, hits = (int(x) for x in totals)
+        rays, simd_rays, packets, hits = (int(x) for x in totals)
         levels = [
             {"nodes": nodes, "tests": tests, "hits": hits, "misses": tests - hits}
             for nodes, tests, hits in zip(
@@ -139,6 +164,9 @@ class PacketTracer:
             triangles=self.geometry.num_triangles,
             batches=1,
             structure_bytes=bvh.nbytes,
+            packets=packets,
+            simd_rays=simd_rays,
+            by_depth=by_depth,
         )
 
     def _kernels(self, bvh):
