@@ -205,8 +205,8 @@ inline bool all_blocked(const Packet *p)
 }
 
 // Tests the active SIMD rays against the triangles of a leaf that the frustum does not cull.
-inline void visit_leaf(Packet *p, const Node *cell, const uchar *active, uint num_active,
-                       global const float4 *triangles, bool any_hit,
+inline void visit_leaf(Packet *p, uint traversal, const Node *cell, const uchar *active,
+                       uint num_active, global const float4 *triangles, bool any_hit,
                        ulong (*counters)[NUM_COUNTERS], uint depth)
 {
     uint slots[LEAF_SIZE], count = 0;
@@ -225,7 +225,8 @@ inline void visit_leaf(Packet *p, const Node *cell, const uchar *active, uint nu
     COUNT(TRIANGLE_TESTS, num_active * count);
     for (uint i = 0; i < num_active; i++) {
         SimdRay *r = p->rays + active[i];
-        COUNT(ALIVE, meet(r, cell->low, cell->high) != 0);
+        // Masked and Partition have tested them all.
+        COUNT(ALIVE, traversal != RANGED || meet(r, cell->low, cell->high));
         intersect_triangles(r, slots, count, triangles);
         const VI hit = r->triangle != INVALID;
         // The next number: distances may be so small that they round to 0.
@@ -271,7 +272,7 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
             if (traversal == RANGED)
                 activate_range(p, &node, state, counters, depth);
             const bool partition = traversal == PARTITION;
-            visit_leaf(p, &node, partition ? p->indices : p->active,
+            visit_leaf(p, traversal, &node, partition ? p->indices : p->active,
                        partition ? state : p->num_active, triangles, any_hit, counters, depth);
             if (any_hit && all_blocked(p))
                 return;
