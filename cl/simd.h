@@ -6,6 +6,7 @@
 // seven; both forms round once, so results are equal bit for bit.
 //
 //   FMA(a, b, c), FMA16(a, b, c)   a * b + c, rounded once
+//   FMA4(a, b, c), MASK4(m)        the same for float4 and int4
 //   SQRT16(v)                      square roots, correctly rounded
 //   MASK16(m)                      bit i: lane i of a comparison's result (0 or -1)
 //   COUNT16(mask), COUNT64(mask)   number of bits set
@@ -31,6 +32,8 @@
 
 #define X86_BUILTINS
 #define FMA(a, b, c) __builtin_fmaf(a, b, c)
+#define FMA4(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
+#define MASK4(m) ((uint)__builtin_ia32_movmskps(as_float4(m)))
 #define COUNT16(mask) ((uint)__builtin_popcount(mask))
 #define COUNT64(mask) ((uint)__builtin_popcountl(mask))
 #define LOWEST(mask) ((uint)__builtin_ctz(mask))
@@ -85,6 +88,7 @@ inline uint MASK16(int16 m)
 #else
 
 #define FMA(a, b, c) fma(a, b, c)
+#define FMA4(a, b, c) fma(a, b, c)
 #define FMA16(a, b, c) fma(a, b, c)
 #define SQRT16(v) sqrt(v)
 
@@ -96,6 +100,12 @@ inline uint MASK16(int16 m)
     const int8 a = bits.lo | bits.hi;
     const int4 b = a.lo | a.hi;
     return (uint)((b.x | b.y) | (b.z | b.w));
+}
+
+inline uint MASK4(int4 m)
+{
+    const int4 bits = m & (int4)(1, 2, 4, 8);
+    return (uint)((bits.x | bits.y) | (bits.z | bits.w));
 }
 
 #define COUNT16(mask) popcount((uint)(mask))
