@@ -284,67 +284,131 @@ inline void traverse(Packet *p, uint traversal, global const Node *nodes,
     }
 }
 
+// Where results go: hits, or flags.
+typedef struct {
+    global const float4 *triangles; // by their numbers
+    global float *t, *u, *v;
+    global uint *triangle;
+    global uchar *blocked;
+} Results;
+
+inline void scatter(VU ray, VU values, global uint *to)
+{
+    uint rays[WIDTH] __attribute__((aligned(64))), lanes[WIDTH] __attribute__((aligned(64)));
+    *(VU *)rays = ray, *(VU *)lanes = values;
+    for (uint lane = 0; lane < WIDTH; lane++)
+        if (rays[lane] != INVALID)
+            to[rays[lane]] = lanes[lane];
+}
+
+// Hits as cl/intersect.cl resolves them: inf, INVALID, 0, 0 where missed.
+inline void store_hits(const SimdRay *r, const Results *results)
+{
+    const VI hit = r->triangle != INVALID;
+    VHit h = {INFINITY, 0.0f, 0.0f, 0};
+    if (MASK_V(hit)) {
+        h = hit_again(r, results->triangles);
+        h.t = CHOOSE(hit, h.t, INFINITY), h.u = CHOOSE(hit, h.u, 0.0f), h.v = CHOOSE(hit, h.v, 0.0f);
+    }
+    scatter(r->ray, AS_VU(h.t), (global uint *)results->t);
+    scatter(r->ray, AS_VU(h.u), (global uint *)results->u);
+    scatter(r->ray, AS_VU(h.v), (global uint *)results->v);
+    scatter(r->ray, r->triangle, results->triangle);
+}
+
+inline void store_blocked(const SimdRay *r, global uchar *blocked)
+{
+    uint rays[WIDTH] __attribute__((aligned(64)));
+    *(VU *)rays = r->ray;
+    const uint hit = MASK_V(r->triangle != INVALID);
+    for (uint lane = 0; lane < WIDTH; lane++)
+        if (rays[lane] != INVALID)
+            blocked[rays[lane]] = hit >> lane & 1;
+}
+
+inline void store(const SimdRay *r, bool any_hit, const Results *results)
+{
+    if (any_hit)
+        store_blocked(r, results->blocked);
+    else
+        store_hits(r, results);
+}
+
+// Loads the SIMD rays of a packet that have a live lane.
+inline void load_packet(Packet *p, const Stream *s, uint packet, float size, bool any_hit,
+                        const Results *results)
+{
+    p->count = 0;
+    for (uint place = 0; place < s->packet_side * s->packet_side; place++) {
+        SimdRay *r = p->rays + p->count;
+        if (load_simd_ray(s, packet, place, size, r))
+            p->count++;
+        else
+            store(r, any_hit, results);
+    }
+}
+
 // Work-item g takes the packets g, g + global size, ...; totals[g] are its rays, SIMD rays, packets and
 // rays that hit, counts[g] what it counted by depth.
-#define DEFINE_PACKET_KERNEL(NAME, RESULT, NONE, ANY_HIT, FOUND)                                   \
-    inline void store##NAME(const SimdRay *r, global RESULT *result)                               \
-    {                                                                                              \
-        float t[WIDTH] __attribute__((aligned(64)));                                               \
-        uint id[WIDTH] __attribute__((aligned(64))), ray[WIDTH] __attribute__((aligned(64)));      \
-        *(VF *)t = r->t, *(VU *)id = r->triangle, *(VU *)ray = r->ray;                             \
-        for (uint lane = 0; lane < WIDTH; lane++)                                                  \
-            if (ray[lane] != INVALID)                                                              \
-                result[ray[lane]] = id[lane] == INVALID ? (RESULT)NONE : (RESULT)FOUND;            \
-    }                                                                                              \
-                                                                                                   \
-    kernel void NAME(const uint num_packets, const uint num_rays, const uint width,                \
-                     const uint height, const uint packet_side, const uint traversal,              \
-                     const uint least_active, const uint num_levels,                               \
-                     global const Node *restrict nodes, global const float4 *restrict triangles,   \
-                     global const float4 *restrict org_tnear,                                      \
-                     global const float4 *restrict dir_tfar, global RESULT *restrict result,       \
-                     global ulong *restrict totals, global ulong *restrict counts)                 \
-    {                                                                                              \
-        const Stream stream = {num_rays, width, height, packet_side, org_tnear, dir_tfar};         \
-        const Node root = nodes[0];                                                                \
-        ulong counters[DEPTH][NUM_COUNTERS];                                                       \
-        for (uint depth = 0; depth < num_levels; depth++)                                          \
-            for (uint k = 0; k < NUM_COUNTERS; k++)                                                \
-                counters[depth][k] = 0;                                                            \
-        ulong rays = 0, simd_rays = 0, packets = 0, hits = 0;                                      \
-        Packet p;                                                                                  \
-        p.least_active = least_active;                                                             \
-        for (uint packet = get_global_id(0); packet < num_packets;                                 \
-             packet += get_global_size(0)) {                                                       \
-            p.count = 0;                                                                           \
-            for (uint place = 0; place < packet_side * packet_side; place++) {                     \
-                SimdRay *r = p.rays + p.count;                                                     \
-                if (load_simd_ray(&stream, packet, place, box_size(root.low, root.high), r))       \
-                    p.count++;                                                                     \
-                else                                                                               \
-                    store##NAME(r, result);                                                        \
-            }                                                                                      \
-            if (p.count == 0)                                                                      \
-                continue;                                                                          \
-            prepare(&p, width != 0 && p.count == packet_side * packet_side ? packet_side : 0,      \
-                    root.low, root.high);                                                          \
-            traverse(&p, traversal, nodes, triangles, ANY_HIT, counters);                          \
-            packets++;                                                                             \
-            simd_rays += p.count;                                                                  \
-            for (uint i = 0; i < p.count; i++) {                                                   \
-                const SimdRay *r = p.rays + i;                                                     \
-                rays += COUNT16(r->live);                                                          \
-                hits += COUNT16(MASK_V(r->triangle != INVALID));                                   \
-                store##NAME(r, result);                                                            \
-            }                                                                                      \
-        }                                                                                          \
-        global ulong *mine = totals + 4 * (ulong)get_global_id(0);                                 \
-        mine[0] = rays, mine[1] = simd_rays, mine[2] = packets, mine[3] = hits;                    \
-        for (uint depth = 0; depth < num_levels; depth++)                                          \
-            for (uint k = 0; k < NUM_COUNTERS; k++)                                                \
-                counts[(get_global_id(0) * num_levels + depth) * NUM_COUNTERS + k]                 \
-                    = counters[depth][k];                                                          \
+inline void trace_packets(const Stream *stream, uint num_packets, uint traversal, uint least_active,
+                          uint num_levels, global const Node *nodes,
+                          global const float4 *triangles, bool any_hit, const Results *results,
+                          global ulong *totals, global ulong *counts)
+{
+    const Node root = nodes[0];
+    const uint whole = stream->packet_side * stream->packet_side;
+    ulong counters[DEPTH][NUM_COUNTERS];
+    for (uint depth = 0; depth < num_levels; depth++)
+        for (uint k = 0; k < NUM_COUNTERS; k++)
+            counters[depth][k] = 0;
+    ulong rays = 0, simd_rays = 0, packets = 0, hits = 0;
+    Packet p;
+    p.least_active = least_active;
+    for (uint packet = get_global_id(0); packet < num_packets; packet += get_global_size(0)) {
+        load_packet(&p, stream, packet, box_size(root.low, root.high), any_hit, results);
+        if (p.count == 0)
+            continue;
+        const bool tile = stream->width != 0 && p.count == whole;
+        prepare(&p, tile ? stream->packet_side : 0, root.low, root.high);
+        traverse(&p, traversal, nodes, triangles, any_hit, counters);
+        packets++;
+        simd_rays += p.count;
+        for (uint i = 0; i < p.count; i++) {
+            rays += COUNT16(p.rays[i].live);
+            hits += COUNT16(MASK_V(p.rays[i].triangle != INVALID));
+            store(p.rays + i, any_hit, results);
+        }
     }
+    global ulong *mine = totals + 4 * (ulong)get_global_id(0);
+    mine[0] = rays, mine[1] = simd_rays, mine[2] = packets, mine[3] = hits;
+    for (uint depth = 0; depth < num_levels; depth++)
+        for (uint k = 0; k < NUM_COUNTERS; k++)
+            counts[(get_global_id(0) * num_levels + depth) * NUM_COUNTERS + k] = counters[depth][k];
+}
 
-DEFINE_PACKET_KERNEL(intersect_packets, ulong, MISS, false, hit_key(t[lane], id[lane]))
-DEFINE_PACKET_KERNEL(occlude_packets, uchar, 0, true, 1)
+#define STREAM_AND_TREE                                                                            \
+    const uint num_packets, const uint num_rays, const uint width, const uint height,              \
+        const uint packet_side, const uint traversal, const uint least_active,                     \
+        const uint num_levels, global const Node *restrict nodes,                                  \
+        global const float4 *restrict triangles, global const float4 *restrict org_tnear,          \
+        global const float4 *restrict dir_tfar
+
+kernel void intersect_packets(STREAM_AND_TREE, global const float4 *restrict numbered,
+                              global float *restrict t, global uint *restrict triangle,
+                              global float *restrict u, global float *restrict v,
+                              global ulong *restrict totals, global ulong *restrict counts)
+{
+    const Stream stream = {num_rays, width, height, packet_side, org_tnear, dir_tfar};
+    const Results results = {numbered, t, u, v, triangle, 0};
+    trace_packets(&stream, num_packets, traversal, least_active, num_levels, nodes, triangles,
+                  false, &results, totals, counts);
+}
+
+kernel void occlude_packets(STREAM_AND_TREE, global uchar *restrict blocked,
+                            global ulong *restrict totals, global ulong *restrict counts)
+{
+    const Stream stream = {num_rays, width, height, packet_side, org_tnear, dir_tfar};
+    const Results results = {0, 0, 0, 0, 0, blocked};
+    trace_packets(&stream, num_packets, traversal, least_active, num_levels, nodes, triangles, true,
+                  &results, totals, counts);
+}

@@ -19,6 +19,7 @@ typedef TriangleHit16 VHit;
 #define SIDE 4 // of the square of pixels that a SIMD ray covers
 #define AS_VF as_float16
 #define AS_VI as_int16
+#define AS_VU as_uint16
 #define FMA_V(a, b, c) FMA16(a, b, c)
 #define MASK_V(m) MASK16(m)
 #define INSIDE_EDGES inside_edges16
@@ -47,6 +48,7 @@ typedef TriangleHit4 VHit;
 #define SIDE 2
 #define AS_VF as_float4
 #define AS_VI as_int4
+#define AS_VU as_uint4
 #define FMA_V(a, b, c) FMA4(a, b, c)
 #define MASK_V(m) MASK4(m)
 #define INSIDE_EDGES inside_edges4
@@ -210,6 +212,31 @@ inline void intersect_triangles(SimdRay *r, const uint *slots, uint count,
         frame = mixed_frame(r);
         TEST_TRIANGLES(INSIDE_EDGES, &frame)
     }
+}
+
+typedef struct {
+    VF x, y, z;
+} VCorner;
+DEFINE_TRIANGLE_TEST(_lanes, VF, VI, FMA_V, VFrame, VCorner, VHit)
+
+// The hits of all lanes, each with the triangle that is its closest.
+inline VHit hit_again(const SimdRay *r, global const float4 *triangles)
+{
+    uint ids[WIDTH] __attribute__((aligned(64)));
+    *(VU *)ids = r->triangle != INVALID ? r->triangle : (VU)0;
+    VCorner corners[3];
+    for (uint k = 0; k < 3; k++) {
+        float4 s[WIDTH] __attribute__((aligned(64)));
+        for (uint lane = 0; lane < WIDTH; lane++)
+            s[lane] = triangles[TRIANGLE_FLOAT4S * (ulong)ids[lane] + k];
+        VF unused;
+        TRANSPOSE(s, corners[k].x, corners[k].y, corners[k].z, unused)
+    }
+    const VFrame frame = mixed_frame(r);
+    VF edges[3], depths[3];
+    const VI inside
+        = inside_edges_lanes(&frame, corners[0], corners[1], corners[2], edges, depths);
+    return finish_hit_lanes(&frame, inside, edges, depths);
 }
 
 // Fills the rows from the rays of the lanes; lanes that are not live never hit.

@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 
-from raystream import intersect
 from raystream.bvh import LEAF_SIZE, Bvh
 from raystream.checks import check_choice, check_count
+from raystream.intersect import HitStream
 from raystream.statistics import TRAVERSAL, Statistics
 
 TRAVERSALS = ("masked", "ranged", "partition")
@@ -104,16 +104,16 @@ class PacketTracer:
 
     def intersect(self, rays):
         """Closest hits of `rays`; returns (HitStream, Statistics)."""
-        closest = self.session.empty(len(rays), np.uint64)
-        statistics = self._trace("intersect_packets", rays, closest)
-        return intersect.resolve(self.session, closest, rays, self.geometry.triangles), statistics
+        hits = HitStream.empty(self.session, len(rays))
+        results = self.geometry.triangles, hits.t, hits.triangle, hits.u, hits.v
+        return hits, self._trace("intersect_packets", rays, *results)
 
     def occluded(self, rays):
         """Whether anything lies in each ray's segment; returns (uint8 Array, Statistics)."""
         blocked = self.session.empty(len(rays), np.uint8)
         return blocked, self._trace("occlude_packets", rays, blocked)
 
-    def _trace(self, kernel, rays, result):
+    def _trace(self, kernel, rays, *results):
         bvh = self.bvh()
         size = self._packet_size
         width, height = (0, 0) if rays.size is None else rays.size
@@ -136,7 +136,7 @@ class PacketTracer:
             bvh.triangles,
             rays.org_tnear,
             rays.dir_tfar,
-            result,
+            *results,
             totals,
             counts,
         )
