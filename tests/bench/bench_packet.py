@@ -146,13 +146,9 @@ def depths_study(name, options):
 
 def check_numpy_counts(scene, stream, choice, by_depth):
     """Trace the same rays in numpy and compare every counter, depth by depth."""
-    tracer = PacketTracer.from_scene(scene, precision="single", **choice)
-    org_tnear, dir_tfar = stream.org_tnear.get(), stream.dir_tfar.get()
-    active, (origins, directions, tnear, tfar) = live_rays(stream)
-    width = stream.size[0] * stream.size[1]
-    assert len(org_tnear) == len(dir_tfar) == width
-    pixels = np.flatnonzero(active)
-    tracer.intersect(origins, directions, tnear, tfar, size=stream.size, pixels=pixels)
+    tracer = PacketTracer(scene.vertices, scene.faces, precision="single", **choice)
+    active, rays = live_rays(stream)
+    tracer.intersect(*rays, size=stream.size, pixels=np.flatnonzero(active))
     for counter, counts in by_depth.items():
         expected = getattr(tracer.statistics, f"{counter}_by_depth").tolist()
         if counts != expected:
