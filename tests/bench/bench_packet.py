@@ -60,6 +60,7 @@ DEPTHS_SCENES = ("meadow",)
 # The paper's own: SIMD rays of 2 x 2, the frustum asked of every box.
 PAPER = {"simd_width": 4, "least_active": 1}
 THREADS = 2
+MOST_SECONDS = 5.0  # no further runs of some tracers after so long
 
 
 # --- Timing ---
@@ -78,11 +79,15 @@ def trace(tracer, kind, streams):
 
 def best_in_turn(tracers, kind, streams, repeats):
     """The best seconds of each of several tracers, which run one after another."""
+    for tracer in tracers:
+        trace(tracer, kind, streams[:1])  # builds the hierarchy
     seconds = [[] for _ in tracers]
-    for _ in range(1 + repeats):  # the first run builds the hierarchy
+    for _ in range(repeats):
         for tracer, times in zip(tracers, seconds, strict=True):
             times.append(trace(tracer, kind, streams)[0])
-    return [min(times[1:]) for times in seconds]
+        if sum(map(sum, seconds)) > MOST_SECONDS:
+            break
+    return [min(times) for times in seconds]
 
 
 def number_of_rays(tracer, kind, streams):

@@ -56,7 +56,7 @@ def _draw_lines(panel, rows, lines):
         highest[label] = max(times)
     if "masked" in highest:  # its times explode; the others' differences are to be seen
         others = max(value for label, value in highest.items() if label != "masked")
-        panel.set_ylim(0, min(1.08 * highest["masked"], 1.6 * others))
+        panel.set_ylim(0, min(1.08 * max(highest.values()), 1.6 * others))
     panel.set_ylim(bottom=0)
     panel.set_xticks(range(len(sizes)), sizes)
     panel.grid(alpha=0.4)
