@@ -76,6 +76,10 @@ inline bool load_simd_ray(const Stream *s, uint packet, uint place, float size, 
     float4 directions[WIDTH] __attribute__((aligned(64)));
     for (uint lane = 0; lane < WIDTH; lane++) {
         const uint ray = rays[lane] == INVALID ? 0 : rays[lane];
+        if (lane % SIDE == 0) { // the rows below are read soon
+            PREFETCH(s->org_tnear + ray + SIDE * (ulong)s->width);
+            PREFETCH(s->dir_tfar + ray + SIDE * (ulong)s->width);
+        }
         origins[lane] = s->org_tnear[ray];
         directions[lane] = s->dir_tfar[ray];
     }
@@ -296,9 +300,14 @@ inline void scatter(VU ray, VU values, global uint *to)
 {
     uint rays[WIDTH] __attribute__((aligned(64))), lanes[WIDTH] __attribute__((aligned(64)));
     *(VU *)rays = ray, *(VU *)lanes = values;
-    for (uint lane = 0; lane < WIDTH; lane++)
-        if (rays[lane] != INVALID)
-            to[rays[lane]] = lanes[lane];
+    const bool whole = MASK_V(ray == INVALID) == 0;
+    for (uint lane = 0; lane < WIDTH; lane += SIDE)
+        if (whole) // rows of a square, or rays in order
+            STORE_ROW(to + rays[lane], lanes + lane);
+        else
+            for (uint k = lane; k < lane + SIDE; k++)
+                if (rays[k] != INVALID)
+                    to[rays[k]] = lanes[k];
 }
 
 // Hits as cl/intersect.cl resolves them: inf, INVALID, 0, 0 where missed.

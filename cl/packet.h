@@ -16,6 +16,7 @@ typedef RayFrame16 VFrame;
 typedef TriangleHit16 VHit;
 #define LANES (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
 #define TRANSPOSE(s, x, y, z, w) TRANSPOSE16(s, x, y, z, w)
+#define STORE_ROW(to, from) STORE_UNALIGNED_QUAD(to, *(const uint4 *)(from))
 #define SIDE 4 // of the square of pixels that a SIMD ray covers
 #define AS_VF as_float16
 #define AS_VI as_int16
@@ -45,6 +46,7 @@ typedef TriangleHit4 VHit;
     to_y = (float4)(s[0].y, s[1].y, s[2].y, s[3].y);                                               \
     to_z = (float4)(s[0].z, s[1].z, s[2].z, s[3].z);                                               \
     to_w = (float4)(s[0].w, s[1].w, s[2].w, s[3].w);
+#define STORE_ROW(to, from) (to)[0] = (from)[0], (to)[1] = (from)[1]
 #define SIDE 2
 #define AS_VF as_float4
 #define AS_VI as_int4

@@ -23,6 +23,7 @@
 //   TRANSPOSE16(s, x, y, z, w)     sixteen float4 s[] as four float16 rows
 //   CONVERT(T, v)                  lane by lane, as a cast
 //   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
+//   STORE_UNALIGNED_QUAD(p, v)     v an uint4
 //   PREFETCH(p)                    the line at p will be read
 //   STORE_STREAMING(T, p, v)       to global memory aligned to T, past the caches
 //
@@ -152,6 +153,8 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define STORE_UNALIGNED(T, p, v)                                                                   \
     (((global struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value = (v))
 
+#define STORE_UNALIGNED_QUAD(p, v) STORE_UNALIGNED(uint4, p, v)
+
 // Within each 128-bit lane, four rows of four become four columns.
 #define LOW_QUADS(a, b)                                                                            \
     __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29)
@@ -183,6 +186,7 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define CONVERT_(T, v) convert_##T(v)
 #define LOAD_UNALIGNED(T, p) vload16(0, p)
 #define STORE_UNALIGNED(T, p, v) vstore16(v, 0, p)
+#define STORE_UNALIGNED_QUAD(p, v) vstore4(v, 0, p)
 
 #define TRANSPOSE16(s, to_x, to_y, to_z, to_w)                                                     \
     {                                                                                              \
