@@ -172,13 +172,15 @@ _PACKETS = {
 
 def table_study(name, options):
     """Frames by packets of 16 x 16 and of 2 x 2: whole frames, and their tracing alone."""
-    scene, bounces = load(name, options.folder), TABLE[name]
+    scene, (bounces, lights) = load(name, options.folder), TABLE[name]
+    scene.set_lights(scene.lights[: max(lights, 1)])
     renderers = {key: rs.Renderer(scene, "packet", **given) for key, given in _PACKETS.items()}
     frame, tracing = ({key: [] for key in renderers} for _ in range(2))
     for _ in tqdm(range(1 + options.repeats), name, disable=None, leave=False):
         for key, renderer in renderers.items():
             start = time.perf_counter()
-            result = renderer.render(size=options.size, max_bounces=bounces, primary="trace")
+            result = renderer.render(size=options.size, max_bounces=bounces, shadows=lights > 0,
+                                     primary="trace")  # fmt: skip
             frame[key].append(time.perf_counter() - start)
             tracing[key].append(result.statistics.stages[TRAVERSAL]["wall"])
     rays = {kind: counts.rays for kind, counts in result.kinds.items()}

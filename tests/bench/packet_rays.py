@@ -22,8 +22,8 @@ STUDIED = {
     "meadow": rs.scenes.meadow,
     "rings": lambda: rs.scenes.rings(3),
 }
-# Table 2: scene, and generations of secondary rays as in figure 1.
-TABLE = {"toys": 1, "meadow": 1, MUSEUM: 3, KITCHEN: 4}
+# Table 2: scene, generations of secondary rays and lights that cast shadows, as in figure 1.
+TABLE = {"toys": (1, 2), "meadow": (1, 0), MUSEUM: (3, 0), KITCHEN: (4, 1)}
 _DEPTH = 2  # of reflections and refractions in figures 5 and 7
 
 
