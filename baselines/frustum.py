@@ -8,10 +8,11 @@ no ray of its packet can meet:
   slabs, or have left the same slab before they start.
 
 Frusta of section 4.1, corners of the screen tile, are used for packets that share an origin and
-lie inside their corner rays; the planes are tilted outwards by what rounding has moved the rays.
+lie inside their corner rays, which are moved outwards by GROW of their distance to the middle.
 All others are made of a near and a far plane (section 4.3). The point light's frustum (section
 4.2) is that construction with all origins in one point: then the near rectangle is that point.
-A packet whose rays do not all advance along its dominant axis, or hardly, has no frustum.
+A packet whose rays do not all advance along its dominant axis, by MIN_ADVANCE of their largest
+component, has no frustum.
 
 Why four corner rays suffice though the rays of a packet do not meet in a point: at each k between
 the planes the rays lie in the rectangle of the corner rays. Let all four pierce a triangle's plane
@@ -23,34 +24,39 @@ likewise: the bounds of u and v rise and fall with k as the corner rays do.
 
 What differs from the paper:
 
-* A plane is made from the bounding (u, v) lines, not from the cross product of equation 2, which
-  is zero for the parallel corner rays of parallel light.
+* A plane is made from lines in (u, v, k), not from the cross product of equation 2, which is zero
+  for the parallel corner rays of parallel light and loses digits where tiles are small.
 * The far plane is at least FAR of the scene's size beyond the near one, so that quotients keep
   their digits.
 
-All in float64. A frustum is wider than its rays by PAD of the coordinates (more than the boxes of
-packet.py are widened), so that it never culls what a test of one of its rays would meet.
+All in float32, in the order of operations of cl/frustum.h, so that the same is culled. Rounding,
+u = 2^-24: let `extent` bound the coordinates of scene, origins and frustum. Slopes are at most 16,
+so what is computed of a ray between the planes errs by at most 120 u extent; a hit of a float32
+triangle test lies up to 40 u extent beside its triangle. PAD is 256 u: near and far rectangle,
+boxes, and the planes once more, are wider by PAD extent.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-PAD = 1e-10
-FAR = 1e-3
-# By how much rays may lie outside of their corner rays: some roundings of float32.
-CORNER_TILT = 1e-5
-# Frusta wider than this, in sizes of scene and origins, cull nothing and are not made.
-WIDEST = 1e6
-# u, v and dominant axis: a cyclic order, so that orientation is kept.
-_CYCLE = np.array([1, 2, 0])
+PAD = np.float32(2.0**-16)
+# Rounding of products: 16 u of them.
+SLACK = np.float32(2.0**-20)
+FAR = np.float32(2.0**-10)
+MIN_ADVANCE = np.float32(2.0**-4)
+GROW = np.float32(2.0**-10)
+# Scenes of other sizes have no frusta: products of four coordinates must stay in float32's range.
+SMALLEST_SIZE, LARGEST_SIZE = 2.0**-30, 2.0**60
 # Corners of a rectangle, around it: which end of the u interval, which of the v interval.
 _U_END, _V_END = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
+# The planes u min, v min, u max, v max: which way is out.
+_OUTWARD = np.float32([-1, -1, 1, 1])
 
 
 @dataclass
 class Frusta:
-    """One frustum for each of p packets; all arrays float64.
+    """One frustum for each of p packets; all arrays float32.
 
     Attributes
     ----------
@@ -63,11 +69,11 @@ class Frusta:
     normals : (p, 4, 3)
         Outward, of any length.
     offsets : (p, 4)
-        A point x is outside of a plane where normal . x - offset > 0.
+        A point x is outside of a plane where normal . x > offset.
     origins, directions : (p, 4, 3)
         Corner rays, around the frustum.
-    size : (p,)
-        Largest |coordinate| that the frustum is made from and used with.
+    pad : (p,)
+        By how much a box is widened for the corner rays.
     """
 
     valid: np.ndarray
@@ -77,7 +83,7 @@ class Frusta:
     offsets: np.ndarray
     origins: np.ndarray
     directions: np.ndarray
-    size: np.ndarray
+    pad: np.ndarray
 
     def cull_boxes(self, packets, low, high, planes=True, corner_rays=True):
         """Return which boxes no ray of their packet can meet.
@@ -85,7 +91,7 @@ class Frusta:
         Parameters
         ----------
         packets : (k,) int
-        low, high : (k, 3) float
+        low, high : (k, 3) float32
         planes, corner_rays : bool
             Which of the two ways to use.
 
@@ -94,13 +100,14 @@ class Frusta:
         (k,) bool
             False for packets without a frustum.
         """
-        pad = (PAD * self.size[packets])[:, None]
-        low, high = low - pad, high + pad
         culled = np.zeros(len(packets), bool)
         if planes:
             culled |= self._planes_cull_boxes(packets, low, high)
         if corner_rays:
-            culled |= self._by_corner_rays(_rays_cull_boxes, packets, culled, low, high)
+            pad = self.pad[packets, None]
+            culled |= self._by_corner_rays(
+                _rays_cull_boxes, packets, culled, low - pad, high + pad
+            )
         return culled
 
     def cull_triangles(self, packets, corners, planes=True, corner_rays=True):
@@ -109,24 +116,20 @@ class Frusta:
         if planes:
             culled |= self._planes_cull_triangles(packets, corners)
         if corner_rays:
-            pad = PAD * self.size[packets] ** 2
+            pad = self.pad[packets]
             culled |= self._by_corner_rays(_rays_cull_triangles, packets, culled, corners, pad)
         return culled
 
     def _planes_cull_boxes(self, packets, low, high):
-        normals, offsets = self.normals[packets], self.offsets[packets]
+        normals = self.normals[packets]
         # The box's vertex that lies least outside has the smallest product along each axis.
-        least = np.minimum(normals * low[:, None], normals * high[:, None]).sum(axis=2)
-        return self.valid[packets] & (least - offsets > self._plane_pads(packets)).any(axis=1)
+        x, y, z = np.moveaxis(np.minimum(normals * low[:, None], normals * high[:, None]), 2, 0)
+        return self.valid[packets] & (x + y + z > self.offsets[packets]).any(axis=1)
 
     def _planes_cull_triangles(self, packets, corners):
-        heights = np.einsum("kic,kjc->kij", self.normals[packets], corners)
-        outside = heights.min(axis=2) - self.offsets[packets] > self._plane_pads(packets)
+        heights = dot(self.normals[packets][:, :, None], corners[:, None])
+        outside = heights.min(axis=2) > self.offsets[packets]
         return self.valid[packets] & outside.any(axis=1)
-
-    def _plane_pads(self, packets):
-        lengths = np.abs(self.normals[packets]).sum(axis=2)
-        return PAD * self.size[packets, None] * lengths
 
     def _by_corner_rays(self, test, packets, culled, *arguments):
         """Return `test` of the corner rays for what is not culled yet."""
@@ -138,6 +141,23 @@ class Frusta:
         return result
 
 
+def dot(a, b):
+    """Return the scalar products along the last axis, summed in order."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def cross(a, b):
+    """Return the cross products along the last axis."""
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def sum_of_components(a):
+    """Return |x| + |y| + |z| along the last axis."""
+    x, y, z = np.moveaxis(np.abs(a), -1, 0)
+    return x + y + z
+
+
 def _rays_cull_boxes(origins, directions, low, high):
     """Return which boxes (k, 3) all corner rays (k, 4, 3) miss in the same way.
 
@@ -145,7 +165,7 @@ def _rays_cull_boxes(origins, directions, low, high):
     misses the box if it leaves one slab before it enters another, or before it starts.
     """
     rising = (directions > 0).all(axis=1)
-    sign = np.where(rising, 1.0, -1.0)
+    sign = np.where(rising, np.float32(1), np.float32(-1))
     steady = rising | (directions < 0).all(axis=1)
     leave = np.where(rising, high, low)[:, None] - origins
     enter = np.where(rising, low, high)[:, None] - origins
@@ -155,8 +175,8 @@ def _rays_cull_boxes(origins, directions, low, high):
             # leave_a / d_a < enter_b / d_b, times d_a d_b, which is not 0
             left = leave[..., a] * directions[..., b]
             right = enter[..., b] * directions[..., a]
-            slack = PAD * (np.abs(left) + np.abs(right))
-            before = (sign[:, a] * sign[:, b])[:, None] * (right - left) > slack
+            before = (sign[:, a] * sign[:, b])[:, None] * (right - left)
+            before = before > SLACK * (np.abs(left) + np.abs(right))
             missed |= steady[:, a] & steady[:, b] & before.all(axis=1)
     return missed
 
@@ -164,189 +184,244 @@ def _rays_cull_boxes(origins, directions, low, high):
 def _rays_cull_triangles(origins, directions, corners, pad):
     """Return which triangles (k, 3, 3) all corner rays (k, 4, 3) pass outside of one edge.
 
-    `pad` times the length of the direction is the rounding allowed for.
+    They do so, too, when moved by `pad`. On which side of an edge a ray passes is the sign of the
+    volume of edge, way from the ray's origin to the edge, and direction.
     """
-    relative = corners[:, None] - origins[:, :, None]
-    moments = np.cross(relative, np.roll(relative, -1, axis=2))
-    sides = np.einsum("kmec,kmc->kme", moments, directions)
-    slack = pad[:, None] * np.abs(directions).sum(axis=2)
-    facing = sides.sum(axis=2)
-    culled = np.zeros(len(corners), bool)
-    for sign in (1, -1):
-        faced = (sign * facing > slack).all(axis=1)
-        outside = (sign * sides < -slack[..., None]).all(axis=1).any(axis=1)
-        culled |= faced & outside
-    return culled
+    edges = np.roll(corners, -1, axis=1) - corners
+    lengths, sizes = sum_of_components(directions), sum_of_components(edges)
+    facing = dot(directions, cross(edges[:, 0], edges[:, 1])[:, None])
+    slack = SLACK * (sizes[:, 0] * sizes[:, 1])[:, None] * lengths
+    front, back = (facing > slack).all(axis=1), (facing < -slack).all(axis=1)
+    relative = corners[:, None] - origins[:, :, None]  # packet, ray, edge
+    x, y, z = np.moveaxis(relative, 3, 0)
+    ex, ey, ez = np.moveaxis(edges[:, None], 3, 0)
+    dx, dy, dz = np.moveaxis(directions[:, :, None], 3, 0)
+    sides = dx * (y * ez - z * ey) + dy * (z * ex - x * ez) + dz * (x * ey - y * ex)
+    margin = (pad[:, None] * sizes)[:, None] * lengths[..., None]
+    sides = np.where(front[:, None, None], sides, -sides)
+    return (front | back) & (sides < -margin).all(axis=1).any(axis=1)
 
 
-def bound_packets(origins, directions, live, first, corner_lanes, scene_low, scene_high):
+class PacketRays:
+    """The rays of packets, (n, width) SIMD rays of which packet k has the rows from first[k] on.
+
+    Parameters
+    ----------
+    origins, units : (n, width, 3) float32
+        `units` have 1 or -1 as their largest component.
+    live : (n, width) bool
+        Lanes that hold a ray; every packet has one.
+    first : (p,) int
+    """
+
+    def __init__(self, origins, units, live, first):
+        self.origins, self.units, self.live, self.first = origins, units, live, first
+        self.count = np.diff(np.append(first, len(live)))
+        self.packet = np.repeat(np.arange(len(first)), self.count)
+
+    def least(self, values):
+        """Return the minima by packet of (n, width, ...), dead lanes left out."""
+        return np.minimum.reduceat(self._over_lanes(np.minimum, values, np.inf), self.first)
+
+    def most(self, values):
+        """Return the maxima by packet."""
+        return np.maximum.reduceat(self._over_lanes(np.maximum, values, -np.inf), self.first)
+
+    def _over_lanes(self, function, values, neutral):
+        live = self.live.reshape(self.live.shape + (1,) * (values.ndim - 2))
+        return function.reduce(np.where(live, values, np.float32(neutral)), axis=1)
+
+    def direction(self):
+        """Return the sums of unit directions, (p, 3).
+
+        In the order of the device: SIMD rays onto each other, then halves of the lanes.
+        """
+        units = np.where(self.live[..., None], self.units, np.float32(0))
+        total = np.zeros((len(self.first), *units.shape[1:]), np.float32)
+        for place in range(self.count.max(initial=0)):
+            rows = np.flatnonzero(self.count > place)
+            total[rows] += units[self.first[rows] + place]
+        while total.shape[1] > 1:
+            half = total.shape[1] // 2
+            total = total[:, :half] + total[:, half:]
+        return total[:, 0]
+
+
+def bound_packets(rays, direction, corner_lanes, scene_low, scene_high):
     """Make the frusta of packets.
 
     Parameters
     ----------
-    origins, directions : (n, 4, 3) float64
-        SIMD rays, those of a packet side by side.
-    live : (n, 4) bool
-        Lanes that hold a ray; every packet has one.
-    first : (p,) int
-        First SIMD ray of each packet.
+    rays : PacketRays
+    direction : (p, 3) float32
+        rays.direction().
     corner_lanes : (p, 4) int or None
         Rows of origins.reshape(-1, 3) around the screen tile; -1 where a corner is missing.
-    scene_low, scene_high : (3,) float
+    scene_low, scene_high : (3,) float32
 
     Returns
     -------
     Frusta
     """
-    origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    lanes = np.flatnonzero(live)
-    packet = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(live))))[lanes // 4]
-    rays = _Rays(origins[lanes], directions[lanes], packet, len(first))
-    scene = np.array([scene_low, scene_high], np.float64)
-    frusta = near_far_frusta(rays, scene)
-    if corner_lanes is not None:
-        asked = np.flatnonzero((corner_lanes >= 0).all(axis=1) & frusta.shared)
-        asked = asked[live.reshape(-1)[corner_lanes[asked]].all(axis=1)]
-        _use_corner_rays(frusta, rays, asked, directions[corner_lanes[asked]], scene)
+    scene = np.array([scene_low, scene_high], np.float32)
+    with np.errstate(all="ignore"):  # where a packet has no frustum anything may come out
+        axes = _Axes(direction)
+        frusta = near_far_frusta(rays, axes, scene)
+        if corner_lanes is not None:
+            asked = np.flatnonzero(
+                (corner_lanes >= 0).all(axis=1) & frusta.valid & frusta.shared
+            )
+            live = rays.live.reshape(-1)[corner_lanes[asked]].all(axis=1)
+            _use_corner_rays(frusta, rays, axes, asked[live], corner_lanes[asked[live]], scene)
     return frusta
 
 
-class _Rays:
-    """Rays (n, 3) in order of their packets, and reductions over each packet."""
+class _Axes:
+    """The axes u, v and k of packets, in a cyclic order; k is the dominant one.
 
-    def __init__(self, origins, directions, packet, num_packets):
-        self.origins, self.directions, self.packet = origins, directions, packet
-        self._starts = np.searchsorted(packet, np.arange(num_packets))
+    It counts along the rays: values of k are times `sign`.
+    """
 
-    def least(self, values):
-        """Return the minima by packet."""
-        return np.minimum.reduceat(values, self._starts)
+    def __init__(self, direction):
+        k = np.argmax(np.abs(direction), axis=1)
+        self.order = (k[:, None] + [1, 2, 0]) % 3
+        along = np.take_along_axis(direction, self.order[:, 2:], axis=1)
+        self.flip = np.ones((len(k), 3), np.float32)
+        self.flip[:, 2:] = np.where(along < 0, -1, 1)
 
-    def most(self, values):
-        """Return the maxima by packet."""
-        return np.maximum.reduceat(values, self._starts)
+    def turned(self, values, packet=slice(None)):
+        """Return vectors (..., 3) of packets as u, v, k."""
+        return np.take_along_axis(values, self._wide(self.order, packet, values), -1) * self._wide(
+            self.flip, packet, values
+        )
 
-    def sum(self, values):
-        """Return the sums by packet."""
-        return np.add.reduceat(values, self._starts)
+    def turned_back(self, values, packet=slice(None)):
+        """Return vectors (..., 3) of u, v, k as x, y, z."""
+        inverse = np.argsort(self.order, axis=1)
+        return np.take_along_axis(
+            values * self._wide(self.flip, packet, values), self._wide(inverse, packet, values), -1
+        )
+
+    @staticmethod
+    def _wide(by_packet, packet, values):
+        """Return rows of (p, 3) for the axes between the first and the last one of `values`."""
+        rows = by_packet[packet]
+        rows = rows.reshape(len(rows), *(1,) * (values.ndim - 2), 3)
+        return np.broadcast_to(rows, values.shape)
 
 
-def near_far_frusta(rays, scene):
+def near_far_frusta(rays, axes, scene):
     """Return frusta by a near and a far plane (section 4.3; for one origin, section 4.2).
 
-    The dominant axis k is that of the largest component of the summed directions, taken so that
-    the sum is positive. The near plane goes through the smallest k of the origins.
+    The near plane goes through the smallest k of the origins.
     """
-    total = rays.sum(rays.directions)
-    axis = np.argmax(np.abs(total), axis=1)
-    order = (axis[:, None] + _CYCLE) % 3  # u, v, k
-    sign = np.where(np.take_along_axis(total, order[:, 2:], axis=1)[:, 0] < 0, -1.0, 1.0)
-    flip = np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=1)
-    ray_order, ray_flip = order[rays.packet], flip[rays.packet]
-    o = np.take_along_axis(rays.origins, ray_order, axis=1) * ray_flip
-    d = np.take_along_axis(rays.directions, ray_order, axis=1) * ray_flip
-    size = np.maximum(np.abs(scene).max(), rays.most(np.abs(rays.origins).max(axis=1)))
-    near = rays.least(o[:, 2])
-    scene_far = (scene[:, order[:, 2]] * sign).max(axis=0)
-    far = np.maximum(scene_far, near + np.where(size > 0, FAR * size, 1.0))
-    advancing = d[:, 2] > 0
-    slopes = d[:, :2] / np.where(advancing, d[:, 2], 1.0)[:, None]
-    bounds = np.empty((2, 2, len(near), 2))  # near and far, least and most, packet, u and v
-    for k, plane in enumerate((near, far)):
-        place = o[:, :2] + slopes * (plane[rays.packet] - o[:, 2])[:, None]
-        bounds[k] = rays.least(place), rays.most(place)
-    same = (rays.least(rays.origins) == rays.most(rays.origins)).all(axis=1)
-    normals, offsets = _side_planes(bounds, near, far)
-    starts, ends = (_rectangle(bounds[k], plane) for k, plane in enumerate((near, far)))
-    inverse = np.broadcast_to(np.argsort(order, axis=1)[:, None], normals.shape)
-    normals, starts, ends = (
-        np.take_along_axis(values * flip[:, None], inverse, axis=2)
-        for values in (normals, starts, ends)
-    )
-    width = np.abs(bounds).max(axis=(0, 1, 3))
+    o, d = (axes.turned(values, rays.packet) for values in (rays.origins, rays.units))
+    lows, highs = rays.least(rays.origins), rays.most(rays.origins)
+    size = np.maximum(np.maximum(np.abs(lows), np.abs(highs)).max(axis=1), np.abs(scene).max())
+    near = rays.least(o[..., 2])
+    corners = axes.turned(np.broadcast_to(scene, (len(near), 2, 3)))
+    far = np.maximum(corners[..., 2].max(axis=1), near + FAR * size)
+    slopes = d[..., :2] / d[..., 2:]
+    ends = []  # the planes u min, v min, u max, v max
+    for plane in (near, far):
+        place = o[..., :2] + slopes * (plane[rays.packet, None] - o[..., 2])[..., None]
+        ends.append(np.concatenate([rays.least(place), rays.most(place)], axis=1))
+    extent = np.maximum(size, np.abs(ends).max(axis=(0, 2)))
+    pad = PAD * extent
+    at_near, at_far = (places + _OUTWARD * pad[:, None] for places in ends)
+    normals, offsets = _side_planes(at_near, at_far, near, far, pad)
+    starts, stops = _rectangle(at_near, near), _rectangle(at_far, far)
+    directions = stops - starts
+    valid = (size >= SMALLEST_SIZE) & (size <= LARGEST_SIZE)
+    valid &= rays.least(d[..., 2]) >= MIN_ADVANCE
     return Frusta(
-        valid=(rays.least(advancing.astype(np.int8)) > 0) & (width <= WIDEST * size),
-        shared=same,
+        valid=valid,
+        shared=(lows == highs).all(axis=1),
         primary=np.zeros(len(near), bool),
-        normals=normals,
+        normals=axes.turned_back(normals),
         offsets=offsets,
-        origins=starts,
-        directions=ends - starts,
-        size=np.maximum(size, width),
+        origins=axes.turned_back(starts),
+        directions=axes.turned_back(directions),
+        pad=pad,
     )
 
 
-def _side_planes(bounds, near, far):
+def _side_planes(at_near, at_far, near, far, pad):
     """Return normals (p, 4, 3) in (u, v, k) and offsets (p, 4).
 
     The plane of the least u holds the line from (u_near, near) to (u_far, far) and the v axis:
     outside is u_near + s (k - near) - u > 0 with the slope s; of the most u, the opposite.
     """
-    slopes = (bounds[1] - bounds[0]) / (far - near)[:, None]
-    normals = np.zeros((len(near), 4, 3))
-    offsets = np.empty((len(near), 4))
-    for end, outward in ((0, -1.0), (1, 1.0)):
-        for axis in range(2):
-            plane = 2 * end + axis
-            normals[:, plane, axis] = outward
-            normals[:, plane, 2] = -outward * slopes[end, :, axis]
-            offsets[:, plane] = outward * (bounds[0, end, :, axis] - slopes[end, :, axis] * near)
-    return normals, offsets
+    slopes = (at_far - at_near) / (far - near)[:, None]
+    normals = np.zeros((len(near), 4, 3), np.float32)
+    normals[:, range(4), [0, 1, 0, 1]] = _OUTWARD
+    normals[..., 2] = -_OUTWARD * slopes
+    offsets = _OUTWARD * (at_near - slopes * near[:, None])
+    return normals, offsets + pad[:, None] * (np.float32(1) + np.abs(slopes))
 
 
 def _rectangle(bounds, plane):
     """Return the corners, (p, 4, 3) in (u, v, k), around a rectangle."""
-    return np.stack(
-        [bounds[_U_END, :, 0].T, bounds[_V_END, :, 1].T, np.tile(plane[:, None], 4)], axis=2
-    )
+    u, v = bounds[:, 2 * _U_END], bounds[:, 2 * _V_END + 1]
+    return np.stack([u, v, np.broadcast_to(plane[:, None], u.shape)], axis=2)
 
 
-def _use_corner_rays(frusta, rays, asked, corners, scene):
+def _use_corner_rays(frusta, rays, axes, asked, lanes, scene):
     """Replace the frusta of the packets `asked` by those of their corner rays (section 4.1).
 
     Parameters
     ----------
     frusta : Frusta
-    rays : _Rays
+    rays : PacketRays
+    axes : _Axes
     asked : (q,) int
         Packets that share an origin.
-    corners : (q, 4, 3) float64
-        Directions of the corner rays, around the tile.
-    scene : (2, 3) float64
+    lanes : (q, 4) int
+        Rows of their corner rays, around the tile.
+    scene : (2, 3) float32
     """
     if not len(asked):
         return
-    normals = np.cross(corners, np.roll(corners, -1, axis=1))  # equation 2
-    lengths = np.linalg.norm(normals, axis=2, keepdims=True)
-    axes = corners.sum(axis=1)
-    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), np.finfo(float).tiny)
-    inward = np.einsum("qic,qc->qi", normals, axes)
-    proper = (lengths[..., 0] > 0).all(axis=1) & (inward != 0).all(axis=1)
-    proper &= (inward > 0).all(axis=1) | (inward < 0).all(axis=1)
-    normals = normals / np.where(lengths > 0, lengths, 1.0) * -np.sign(inward)[..., None]
+    corners = axes.turned(rays.units.reshape(-1, 3)[lanes], asked)
+    u, v = _grown(corners[..., 0] / corners[..., 2]), _grown(corners[..., 1] / corners[..., 2])
+    du, dv = (np.roll(values, -1, axis=1) - values for values in (u, v))
+    turn = du * np.roll(dv, -1, axis=1) - dv * np.roll(du, -1, axis=1)
+    left, right = (turn > 0).all(axis=1), (turn < 0).all(axis=1)
+    nu, nv = (np.where(left[:, None], values, -values) for values in (dv, -du))
+    width = np.abs(nu) + np.abs(nv)
+    margin = -SLACK * width * (np.float32(1) + (np.abs(u) + np.abs(v)))
     row = np.full(len(frusta.valid), -1)
     row[asked] = np.arange(len(asked))
-    row = row[rays.packet]
-    mine = np.flatnonzero(row >= 0)
-    row, directions = row[mine], rays.directions[mine]
-    starts = np.searchsorted(row, np.arange(len(asked)))
-    along = np.einsum("nc,nc->n", axes[row], directions)
-    proper &= np.minimum.reduceat(along, starts) > 0
-    outside = np.einsum("nic,nc->ni", normals[row], directions)
-    tilt = np.maximum.reduceat(outside / np.where(along > 0, along, 1.0)[:, None], starts)
-    tilt = np.maximum(tilt, 0) + PAD
-    proper &= (tilt < CORNER_TILT).all(axis=1)
-    normals = normals - tilt[..., None] * axes[:, None]
-    edges = np.cross(np.roll(normals, 1, axis=1), normals)
-    edges *= np.sign(np.einsum("qic,qc->qi", edges, axes))[..., None]
-    # A cone of four planes has their intersections as its edges only if it holds all of these.
-    held = np.einsum("qic,qjc->qij", normals, edges) <= PAD * np.abs(edges).sum(axis=2)[:, None]
-    proper &= held.all(axis=(1, 2)) & edges.any(axis=2).all(axis=1)
-    chosen = asked[proper]
-    frusta.valid[chosen] = frusta.primary[chosen] = True
-    frusta.normals[chosen] = normals[proper]
+    mine = np.flatnonzero(row[rays.packet] >= 0)
+    d = axes.turned(rays.units[mine], rays.packet[mine])
+    row = row[rays.packet[mine]]
+    su, sv = d[..., 0] / d[..., 2], d[..., 1] / d[..., 2]
+    outside = np.zeros(len(asked), bool)
+    for k in range(4):
+        across = nu[row, k, None] * (su - u[row, k, None]) + nv[row, k, None] * (
+            sv - v[row, k, None]
+        )
+        beyond = ~(across < margin[row, k, None]) & rays.live[mine]
+        outside[row[beyond.any(axis=1)]] = True
+    good = (left | right) & ~outside
+    chosen, u, v, nu, nv, width = (values[good] for values in (asked, u, v, nu, nv, width))
     apexes = rays.least(rays.origins)[chosen]
-    frusta.offsets[chosen] = np.einsum("qic,qc->qi", normals[proper], apexes)
+    o = axes.turned(apexes, chosen)[:, None]
+    nk = -(nu * u + nv * v)
+    size = np.maximum(np.abs(scene).max(), np.abs(apexes).max(axis=1))
+    frusta.pad[chosen] = PAD * size
+    offsets = nu * o[..., 0] + nv * o[..., 1] + nk * o[..., 2]
+    frusta.offsets[chosen] = offsets + frusta.pad[chosen, None] * (width + np.abs(nk))
+    frusta.primary[chosen] = True
+    frusta.normals[chosen] = axes.turned_back(np.stack([nu, nv, nk], axis=2), chosen)
     frusta.origins[chosen] = apexes[:, None]
-    frusta.directions[chosen] = edges[proper]
-    frusta.size[chosen] = np.maximum(np.abs(scene).max(), np.abs(apexes).max(axis=1))
+    forward = np.ones_like(u)
+    frusta.directions[chosen] = axes.turned_back(np.stack([u, v, forward], axis=2), chosen)
+
+
+def _grown(corners):
+    """Return coordinates (q, 4) moved away from their mean."""
+    mean = np.float32(0.25) * (
+        (corners[:, 0] + corners[:, 1]) + (corners[:, 2] + corners[:, 3])
+    )
+    return corners + GROW * (corners - mean[:, None])

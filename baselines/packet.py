@@ -3,7 +3,8 @@
 Overbeck, Ramamoorthi and Mark, "Large Ray Packets for Real-time Whitted Ray Tracing" (2008):
 Masked, Ranged and Partition traversal (section 3, figure 2, appendix) with the frusta of section
 4. A SIMD ray is four rays, 2 x 2 neighbours on the screen, and the smallest primitive; a packet
-of size n holds n x n rays, which is n x n / 4 SIMD rays, row by row.
+of size n holds n x n rays, which is n x n / 4 SIMD rays, row by row. A `simd_width` of 16 makes
+it 4 x 4 rays, as processors have it now.
 
 Each packet walks the tree by the paper's loop. Here all packets take each turn of their loops
 together, so that numpy has much to do at a time; no packet knows of another, and the counts are
@@ -16,8 +17,14 @@ What counts, and how:
   never hit; a SIMD ray of such lanes only is not part of its packet.
 * A frustum's test of a box or a triangle counts once.
 * Depth is that of the tree node: the root has 0; triangles count at the depth of their leaf.
-* A box counts as overlapped from tnear to the closest hit so far. Boxes are wider by 1e-12 of the
-  coordinates, so that rounding loses no hit.
+* A box counts as overlapped from tnear to the closest hit so far.
+
+What is counted is decided in float32, in the order of operations of cl/packet.h: on the device the
+same is counted, where triangles are tested in float32, too (`precision`). A ray is o + s q with
+q = d / m, m the largest component of |d|, so that nothing leaves float32's range. Rounding,
+u = 2^-24 and D the largest coordinate of a triangle seen from the origin: the triangle test in
+float32 finds a hit up to 20 u D beside the triangle, the box test errs by 5 u D. Boxes are wider
+by BOX_PAD = 64 u of more than D, so that no hit is lost.
 
 Where the paper errs or leaves it open:
 
@@ -32,13 +39,15 @@ Where the paper errs or leaves it open:
 """
 
 import copy
+import math
 from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
+from . import single
 from .arrays import float32_rays
 from .bvh import build_bvh, ranges
-from .frustum import bound_packets
+from .frustum import PacketRays, bound_packets
 from .lighting import direct_light
 from .reference import primary_rays, ray_offset, secondary_rays, select_hits, shade
 from .surface import SurfacePoints, dot, normalised, surface_points
@@ -49,10 +58,12 @@ PACKET_SIZES = (2, 4, 8, 16, 32)
 # SIMD rays traced together, and pairs of (ray, triangle) intersected at once.
 SIMD_RAYS_PER_CHUNK = 1 << 14
 PAIRS_PER_CHUNK = 1 << 16
-# Widening of boxes; the rounding errors of the slab and the triangle test are below 1e-14.
-BOX_PAD = 1e-12
-# Stands for 1 / 0: large, but finite times any float32.
-INVERSE_OF_ZERO = 1e200
+SIMD_WIDTHS = (4, 16)
+PRECISIONS = ("double", "single")
+# Widening of boxes, in parts of the coordinates and near the end of float32's range.
+BOX_PAD, SMALLEST_PAD = np.float32(2.0**-18), np.float32(2.0**-140)
+# Stands for 1 / 0, and for what is beyond: along such an axis a ray moves by less than the pad.
+LARGEST_INVERSE = np.float32(2.0**60)
 
 
 @dataclass
@@ -69,6 +80,8 @@ class PacketStatistics:
         Turns of the loop: (packet, node) pairs, culled ones included.
     box_tests_by_depth, triangle_tests_by_depth : (levels,) int64
         Tests of SIMD rays.
+    box_hits_by_depth : (levels,) int64
+        Box tests in which a ray overlapped the box.
     frustum_box_tests_by_depth, frustum_box_culls_by_depth : (levels,) int64
     frustum_triangle_tests_by_depth, frustum_triangle_culls_by_depth : (levels,) int64
     leaves_by_depth : (levels,) int64
@@ -84,6 +97,7 @@ class PacketStatistics:
     hits: int
     visits_by_depth: np.ndarray
     box_tests_by_depth: np.ndarray
+    box_hits_by_depth: np.ndarray
     triangle_tests_by_depth: np.ndarray
     frustum_box_tests_by_depth: np.ndarray
     frustum_box_culls_by_depth: np.ndarray
@@ -139,7 +153,7 @@ class PacketStatistics:
 
 
 class PacketTracer(HostTracer):
-    """Closest and any hits by ray packets; float64, watertight, the hits of BruteForceTracer.
+    """Closest and any hits by ray packets: watertight, in float64 the hits of BruteForceTracer.
 
     Parameters
     ----------
@@ -149,6 +163,13 @@ class PacketTracer(HostTracer):
     packet_size : {2, 4, 8, 16, 32}
         Rays along a side of a packet; 2 is the single SIMD ray.
     frustum_culling : bool
+    simd_width : {4, 16}
+        Rays of a SIMD ray; at most those of a packet.
+    least_active : int
+        The frustum is asked where at least so many SIMD rays are active; 1: always, as in the
+        paper.
+    precision : {"double", "single"}
+        Of the triangle test: watertight.py, or single.py, whose hits are those of the device.
 
     Raises
     ------
@@ -172,13 +193,22 @@ class PacketTracer(HostTracer):
         traversal="partition",
         packet_size=16,
         frustum_culling=True,
+        simd_width=4,
+        least_active=1,
+        precision="double",
     ):
         if traversal not in TRAVERSALS:
             names = ", ".join(TRAVERSALS)
             raise ValueError(f"traversal: need one of {names}, got {traversal!r}")
         if packet_size not in PACKET_SIZES:
             raise ValueError(f"packet_size: need one of {PACKET_SIZES}, got {packet_size!r}")
+        if simd_width not in SIMD_WIDTHS or simd_width > packet_size**2:
+            raise ValueError(f"simd_width: need one of {SIMD_WIDTHS}, got {simd_width!r}")
+        if precision not in PRECISIONS:
+            names = ", ".join(PRECISIONS)
+            raise ValueError(f"precision: need one of {names}, got {precision!r}")
         self.traversal, self.packet_size = traversal, int(packet_size)
+        self.simd_width, self.least_active, self.precision = simd_width, least_active, precision
         self.frustum_culling = bool(frustum_culling)
         super().__init__(vertices, faces, first_prims)
 
@@ -191,7 +221,7 @@ class PacketTracer(HostTracer):
             As for EmbreeTracer.intersect.
         size : (int, int), optional
             Width and height of the screen: rays are grouped by screen tiles; default: in the
-            order given, four neighbours a SIMD ray.
+            order given, neighbours a SIMD ray.
         pixels : (n,) array_like of int, optional
             With `size`: the pixel, y * width + x, of each ray's ancestral camera ray; default:
             one ray for each pixel in turn. The k-th rays of pixels are grouped with each other.
@@ -209,7 +239,7 @@ class PacketTracer(HostTracer):
     def _prepare(self, triangles):
         corners = triangles.corners()
         self.bvh = build_bvh(corners)
-        self._corners = corners.astype(np.float64)
+        self._corners = corners
         self.statistics = PacketStatistics.zero(self.bvh.num_levels, len(corners))
 
     def _trace(self, rays, size, pixels, any_hit):
@@ -217,24 +247,14 @@ class PacketTracer(HostTracer):
         num_rays = len(rays[0])
         origins, directions, tnear, tfar = rays
         live = directions.any(axis=1) & (tfar >= tnear)
-        packets = _Packets.grouped(num_rays, self.packet_size, size, pixels, live)
+        sides = self.packet_size, math.isqrt(self.simd_width)
+        packets = _Packets.grouped(num_rays, *sides, size, pixels, live)
         result = np.full(num_rays, -1), *np.zeros((3, num_rays))
         self.statistics = PacketStatistics.zero(self.bvh.num_levels, len(self._corners))
         for part in packets.chunks(SIMD_RAYS_PER_CHUNK):
-            simd = _SimdRays(part.lanes, *rays, self.bvh)
-            frusta = None
-            if self.frustum_culling and self.bvh.num_nodes:
-                corner_lanes = part.corner_lanes(self.packet_size) if size is not None else None
-                frusta = bound_packets(
-                    simd.origins,
-                    simd.directions,
-                    simd.live,
-                    part.first,
-                    corner_lanes,
-                    self.bvh.low[0],
-                    self.bvh.high[0],
-                )
-            walk = TRAVERSALS[self.traversal](self.bvh, self._corners, simd, part, frusta, any_hit)
+            simd = _SimdRays(part.lanes, *rays, self.bvh, self.precision)
+            corner_lanes = None if size is None else part.corner_lanes(*sides)
+            walk = TRAVERSALS[self.traversal](self, simd, part, corner_lanes, any_hit)
             if self.bvh.num_nodes:
                 walk.run()
             self.statistics.add(walk.counts)
@@ -250,7 +270,7 @@ class _Packets:
 
     Attributes
     ----------
-    lanes : (n, 4) int
+    lanes : (n, width) int
         Rays, -1 where there is none.
     first, count : (p,) int
         SIMD rays of each packet.
@@ -261,18 +281,19 @@ class _Packets:
     count: np.ndarray
 
     @classmethod
-    def grouped(cls, num_rays, packet_size, size, pixels, live):
+    def grouped(cls, num_rays, packet_size, simd_side, size, pixels, live):
         """Group the rays that are `live`, (num_rays,) bool; see PacketTracer.intersect."""
-        simd_per_packet = packet_size * packet_size // 4
+        width = simd_side * simd_side
+        simd_per_packet = packet_size * packet_size // width
         if size is None:
             if pixels is not None:
                 raise ValueError("pixels: need size=(width, height), too")
-            place, lane = np.divmod(np.arange(num_rays), 4)
+            place, lane = np.divmod(np.arange(num_rays), width)
         else:
-            place, lane = _screen_places(num_rays, packet_size, size, pixels)
+            place, lane = _screen_places(num_rays, packet_size, simd_side, size, pixels)
         rays = np.flatnonzero(live)
         used, row = np.unique(place[rays], return_inverse=True)
-        lanes = np.full((len(used), 4), -1)
+        lanes = np.full((len(used), width), -1)
         lanes[row, lane[rays]] = rays
         _, first, count = np.unique(used // simd_per_packet, return_index=True, return_counts=True)
         return cls(lanes, first, count)
@@ -292,18 +313,19 @@ class _Packets:
             )
             start = end
 
-    def corner_lanes(self, packet_size):
+    def corner_lanes(self, packet_size, simd_side):
         """Return the corner rays of packets, around the screen tile, as (p, 4) rows of lanes.
 
         Rows count as in lanes.reshape(-1); -1 for packets with a SIMD ray missing.
         """
-        side = packet_size // 2
+        side, width = packet_size // simd_side, simd_side * simd_side
         simd = np.array([0, side - 1, side * side - 1, side * (side - 1)])
-        corners = 4 * (self.first[:, None] + simd) + [0, 1, 3, 2]
-        return np.where((self.count == side * side)[:, None], corners, -1)
+        lanes = np.array([0, simd_side - 1, width - 1, width - simd_side])
+        whole = (self.count == side * side)[:, None]
+        return np.where(whole, width * (self.first[:, None] + simd) + lanes, -1)
 
 
-def _screen_places(num_rays, packet_size, size, pixels):
+def _screen_places(num_rays, packet_size, simd_side, size, pixels):
     """Return each ray's SIMD ray (numbered by layer, tile, place in it) and lane."""
     width, height = size
     if pixels is None:
@@ -316,11 +338,12 @@ def _screen_places(num_rays, packet_size, size, pixels):
     if num_rays and not (pixels.min() >= 0 and pixels.max() < width * height):
         raise ValueError(f"pixels: need values from 0 to {width * height - 1}")
     y, x = np.divmod(pixels.astype(np.int64), width)
-    side = packet_size // 2
+    side = packet_size // simd_side
     tiles = -(-width // packet_size), -(-height // packet_size)
     tile = (_layers(pixels) * tiles[1] + y // packet_size) * tiles[0] + x // packet_size
-    row, column = y % packet_size // 2, x % packet_size // 2
-    return (tile * side + row) * side + column, 2 * (y % 2) + x % 2
+    row, column = y % packet_size // simd_side, x % packet_size // simd_side
+    lane = simd_side * (y % simd_side) + x % simd_side
+    return (tile * side + row) * side + column, lane
 
 
 def _layers(pixels):
@@ -333,76 +356,92 @@ def _layers(pixels):
 
 
 class _SimdRays:
-    """Rays in float64 by SIMD ray and lane, (n, 4), and the closest hit of each so far."""
+    """Rays by SIMD ray and lane, (n, width), and the closest hit of each so far."""
 
-    def __init__(self, lanes, origins, directions, tnear, tfar, bvh):
+    def __init__(self, lanes, origins, directions, tnear, tfar, bvh, precision):
         self.live = lanes >= 0
-        self.bvh = bvh
-        self.origins, self.directions, self.tnear, tfar = (
-            values[lanes].astype(np.float64) for values in (origins, directions, tnear, tfar)
+        self.bvh, self.precision = bvh, precision
+        self.origins, self.directions, self.tnear, self.tfar = (
+            values[lanes] for values in (origins, directions, tnear, tfar)
         )
-        self.tfar = np.where(self.live, tfar, -np.inf)
-        # Up to where a box counts: the closest hit, rounded up so that ties are found.
-        self.limit = self.tfar.copy()
+        self.directions[~self.live] = 1
         self.t, self.u, self.v = np.zeros((3, *lanes.shape))
         self.face = np.full(lanes.shape, -1)
+        with np.errstate(over="ignore", divide="ignore", under="ignore"):
+            self._set_up(bvh)
+
+    def _set_up(self, bvh):
         size = max(np.abs(bvh.low).max(initial=0), np.abs(bvh.high).max(initial=0))
-        pad = BOX_PAD * (float(size) + np.abs(self.origins).max(axis=2, initial=0))
+        pad = BOX_PAD * (np.float32(size) + np.abs(self.origins).max(axis=2, initial=0))
+        pad += SMALLEST_PAD
         self._above = np.moveaxis(self.origins + pad[..., None], 2, 0).copy()
         self._below = np.moveaxis(self.origins - pad[..., None], 2, 0).copy()
-        zero = self.directions == 0
-        inverse = np.where(zero, INVERSE_OF_ZERO, 1 / np.where(zero, 1, self.directions))
+        self._largest = np.abs(self.directions).max(axis=2, initial=0)
+        self.units = self.directions / self._largest[..., None]
+        inverse = np.float32(1) / self.units
+        inverse = np.clip(inverse, -LARGEST_INVERSE, LARGEST_INVERSE)
         self._inverse = np.moveaxis(inverse, 2, 0).copy()
-        self._low, self._high = bvh.low.T.astype(np.float64), bvh.high.T.astype(np.float64)
+        self._enter = self.tnear * self._largest
+        # Up to where a box counts: the closest hit.
+        self.leave = np.where(self.live, self.tfar * self._largest, np.float32(-np.inf))
+        self._low, self._high = bvh.low.T.copy(), bvh.high.T.copy()
 
     def meet(self, simd, cells):
-        """Return which lanes of SIMD rays overlap the boxes of cells, (k, 4) bool."""
-        entry, leave = self.tnear[simd], self.limit[simd]
-        for axis in range(3):
-            inverse = self._inverse[axis][simd]
-            low = (self._low[axis][cells][:, None] - self._above[axis][simd]) * inverse
-            high = (self._high[axis][cells][:, None] - self._below[axis][simd]) * inverse
-            np.maximum(entry, np.minimum(low, high), out=entry)
-            np.minimum(leave, np.maximum(low, high), out=leave)
+        """Return which lanes of SIMD rays overlap the boxes of cells, (k, width) bool."""
+        entry, leave = self._enter[simd], self.leave[simd]
+        with np.errstate(over="ignore", under="ignore"):
+            for axis in range(3):
+                inverse = self._inverse[axis][simd]
+                low = (self._low[axis][cells][:, None] - self._above[axis][simd]) * inverse
+                high = (self._high[axis][cells][:, None] - self._below[axis][simd]) * inverse
+                np.maximum(entry, np.minimum(low, high), out=entry)
+                np.minimum(leave, np.maximum(low, high), out=leave)
         return entry <= leave
 
-    def intersect(self, simd, lane, face, corners):
+    def _hits(self, simd, lane, corners):
+        """Return hit, t, u, v of pairs of (ray, triangle), within the rays' segments."""
+        origins, directions = self.origins[simd, lane], self.directions[simd, lane]
+        tnear, tfar = self.tnear[simd, lane], self.tfar[simd, lane]
+        if self.precision == "single":
+            return single.intersect_pairs(origins, directions, corners, tnear, tfar)
+        hit, t, u, v = intersect_pairs(
+            *(values.astype(np.float64) for values in (origins, directions, corners))
+        )
+        return hit & (t >= tnear) & (t <= tfar), t, u, v
+
+    def intersect(self, simd, lane, face, corners, any_hit):
         """Test rays against triangles; keep the closest hits, of equal ones the smaller face.
 
         Parameters
         ----------
         simd, lane, face : (k,) int
             Pairs of (ray, triangle); a ray may stand in many.
-        corners : (m, 3, 3) float64
-
-        Returns
-        -------
-        (h,) int
-            Rows of `simd` of the hits; those of one ray may be several.
+        corners : (m, 3, 3) float32
+        any_hit : bool
+            Rays that hit overlap no box any more.
         """
-        hit, t, u, v = intersect_pairs(
-            self.origins[simd, lane], self.directions[simd, lane], corners[face]
-        )
-        hit &= (t >= self.tnear[simd, lane]) & (t <= self.tfar[simd, lane])
+        hit, t, u, v = self._hits(simd, lane, corners[face])
         rows = np.flatnonzero(hit)
-        with np.errstate(over="ignore"):  # a hit beyond float32 is at inf
+        with np.errstate(over="ignore", under="ignore"):  # a hit beyond float32 is at inf
             rounded = t[rows].astype(np.float32)
-            above = np.nextafter(rounded, np.float32(np.inf))
-        ray = 4 * simd[rows] + lane[rows]
+        ray = self.live.shape[1] * simd[rows] + lane[rows]
         order = np.lexsort((face[rows], rounded, ray))
         ray, first = np.unique(ray[order], return_index=True)
         best = order[first]
-        rows, rounded, above = rows[best], rounded[best], above[best]
+        rows, rounded = rows[best], rounded[best]
         simd, lane, face = simd[rows], lane[rows], face[rows]
         old_face = self.face[simd, lane]
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", under="ignore"):
             old = self.t[simd, lane].astype(np.float32)
         closer = (old_face < 0) | (rounded < old) | ((rounded == old) & (face < old_face))
         rows, simd, lane = rows[closer], simd[closer], lane[closer]
         self.face[simd, lane] = face[closer]
         self.t[simd, lane], self.u[simd, lane], self.v[simd, lane] = t[rows], u[rows], v[rows]
-        self.limit[simd, lane] = above[closer]
-        return rows
+        with np.errstate(over="ignore", under="ignore"):
+            # The next number: distances may be so small that they round to 0.
+            above = np.nextafter(rounded[closer], np.float32(np.inf))
+            leave = above * self._largest[simd, lane]
+        self.leave[simd, lane] = -np.inf if any_hit else leave
 
 
 class _Traversal:
@@ -411,16 +450,22 @@ class _Traversal:
     `state` is the integer that the paper calls ia: of each packet, on its stack, too.
     """
 
-    def __init__(self, bvh, corners, simd, packets, frusta, any_hit):
-        self.bvh, self.corners, self.simd, self.frusta = bvh, corners, simd, frusta
-        self.first, self.size, self.any_hit = packets.first, packets.count, any_hit
+    def __init__(self, tracer, simd, packets, corner_lanes, any_hit):
+        bvh = self.bvh = tracer.bvh
+        self.corners, self.least_active = tracer._corners, tracer.least_active
+        self.simd, self.any_hit = simd, any_hit
+        self.first, self.size = packets.first, packets.count
         num_packets = len(self.first)
         self.state = np.zeros(num_packets, np.int64)
         self.cell = np.zeros(num_packets, np.int64)
         self.stack = np.zeros((num_packets, max(bvh.num_levels, 1), 2), np.int64)
         self.stack_size = np.zeros(num_packets, np.int64)
-        directions = np.where(simd.live[..., None], simd.directions, 0).sum(axis=1)
-        self.direction = np.add.reduceat(directions, self.first)
+        rays = PacketRays(simd.origins, simd.units, simd.live, self.first)
+        self.direction = rays.direction()
+        self.frusta = None
+        if tracer.frustum_culling and bvh.num_nodes:
+            box = bvh.low[0], bvh.high[0]
+            self.frusta = bound_packets(rays, self.direction, corner_lanes, *box)
         self.counts = PacketStatistics.zero(bvh.num_levels)
         self.counts.rays, self.counts.simd_rays = int(simd.live.sum()), len(simd.live)
         self.counts.packets = num_packets
@@ -449,15 +494,23 @@ class _Traversal:
         """Return the active SIMD rays at leaves as (row, place in the packet), rows rising."""
         raise NotImplementedError
 
-    def frustum_meets(self, packets, cells):
-        """Return which packets' frusta may overlap their cells' boxes, and count."""
+    def frustum_meets(self, packets, cells, active):
+        """Return which packets, with so many active rays, may overlap their cells' boxes."""
+        met = np.ones(len(packets), bool)
+        rows = self._asked(packets, active)
+        packets, cells = packets[rows], cells[rows]
+        self._count("frustum_box_tests", cells, 1)
+        if len(rows):
+            boxes = self.bvh.low[cells], self.bvh.high[cells]
+            met[rows] = ~self.frusta.cull_boxes(packets, *boxes)
+        self._count("frustum_box_culls", cells, ~met[rows])
+        return met
+
+    def _asked(self, packets, active):
+        """Return the rows of packets whose frusta are asked."""
         if self.frusta is None:
-            return np.ones(len(packets), bool)
-        bounded = self.frusta.valid[packets]
-        self._count("frustum_box_tests", cells, bounded)
-        culled = self.frusta.cull_boxes(packets, self.bvh.low[cells], self.bvh.high[cells])
-        self._count("frustum_box_culls", cells, culled)
-        return ~culled
+            return np.zeros(0, int)
+        return np.flatnonzero(self.frusta.valid[packets] & (active >= self.least_active))
 
     def test(self, packets, places, cells):
         """Return which SIMD rays, by their places in packets, overlap the cells' boxes."""
@@ -486,6 +539,7 @@ class _Traversal:
             open_rows = open_rows[missed & (done[open_rows] < count[open_rows])]
             block *= 4  # the more have missed the more are tested at once, whatever counts
         self._count("box_tests", cells, np.minimum(found + 1, count))
+        self._count("box_hits", cells, found < count)
         return found
 
     def _leaves(self, packets, cells):
@@ -497,7 +551,7 @@ class _Traversal:
         self._count("leaves", cells, 1)
         self._count("active", cells, active)
         self._count("alive", cells[row], lanes.any(axis=1))
-        faces, num_faces = self._leaf_triangles(packets, cells)
+        faces, num_faces = self._leaf_triangles(packets, cells, active)
         self._count("triangle_tests", cells, num_faces * active)
         first_face = np.cumsum(num_faces) - num_faces
         ray, lane = np.nonzero(lanes)
@@ -506,19 +560,21 @@ class _Traversal:
             pair, k = ranges(pairs_of_ray[part])
             pair += part.start
             face = faces[first_face[row[ray[pair]]] + k]
-            self.simd.intersect(simd[ray[pair]], lane[pair], face, self.corners)
+            self.simd.intersect(simd[ray[pair]], lane[pair], face, self.corners, self.any_hit)
         if self.any_hit:
-            found = self.simd.face[simd] >= 0
-            self.simd.limit[simd] = np.where(found, -np.inf, self.simd.limit[simd])
             self._stop_blocked(packets)
 
-    def _leaf_triangles(self, packets, cells):
+    def _leaf_triangles(self, packets, cells, active):
         """Return the triangles that the frusta leave, leaf by leaf, and their number in each."""
         row, place = ranges(self.bvh.count[cells])
         faces = self.bvh.order[self.bvh.first[cells][row] + place]
-        if self.frusta is not None:
-            self._count("frustum_triangle_tests", cells[row], self.frusta.valid[packets[row]])
-            culled = self.frusta.cull_triangles(packets[row], self.corners[faces])
+        asked = self._asked(packets[row], active[row])
+        self._count("frustum_triangle_tests", cells[row[asked]], 1)
+        if len(asked):
+            culled = np.zeros(len(row), bool)
+            culled[asked] = self.frusta.cull_triangles(
+                packets[row[asked]], self.corners[faces[asked]]
+            )
             self._count("frustum_triangle_culls", cells[row], culled)
             row, faces = row[~culled], faces[~culled]
         return faces, np.bincount(row, minlength=len(packets))
@@ -526,7 +582,7 @@ class _Traversal:
     def _stop_blocked(self, packets):
         """Empty the stacks of packets all of whose rays are blocked."""
         row, place = ranges(self.size[packets])
-        open_rays = (self.simd.limit[self.first[packets][row] + place] >= 0).any(axis=1)
+        open_rays = (self.simd.leave[self.first[packets][row] + place] >= 0).any(axis=1)
         open_packets = np.bincount(row, open_rays, minlength=len(packets)) > 0
         self.stack_size[packets[~open_packets]] = 0
 
@@ -559,7 +615,7 @@ class MaskedTraversal(_Traversal):
 
     def enter(self, packets, cells):
         """As the base class says; lines 7 to 13."""
-        reached = self.frustum_meets(packets, cells)
+        reached = self.frustum_meets(packets, cells, self.size[packets])
         inner = self.bvh.left[cells] >= 0
         rows = np.flatnonzero(reached & inner)
         size = self.size[packets[rows]]
@@ -568,6 +624,7 @@ class MaskedTraversal(_Traversal):
         row, place = ranges(self.size[packets[rows]])
         alive = self.test(packets[rows][row], place, cells[rows][row])
         self._count("box_tests", cells[rows], self.size[packets[rows]])
+        self._count("box_hits", cells[rows[row]], alive)
         reached[rows] = np.bincount(row, alive, minlength=len(rows)) > 0
         self._mask = row[alive], place[alive]
         return reached
@@ -585,11 +642,14 @@ class RangedTraversal(_Traversal):
         """As the base class says: getFirstHit."""
         start = self.state[packets]
         found = start.copy()
-        missed = np.flatnonzero(~self.test(packets, start, cells))
+        hit = self.test(packets, start, cells)
+        missed = np.flatnonzero(~hit)
         self._count("box_tests", cells, 1)
+        self._count("box_hits", cells, hit)
         found[missed] = self.size[packets[missed]]
-        rest = missed[self.frustum_meets(packets[missed], cells[missed])]
-        count = self.size[packets[rest]] - start[rest] - 1
+        active = self.size[packets] - start
+        rest = missed[self.frustum_meets(packets[missed], cells[missed], active[missed])]
+        count = active[rest] - 1
         found[rest] = start[rest] + 1
         found[rest] += self.search(packets[rest], cells[rest], start[rest] + 1, 1, count)
         self.state[packets] = found
@@ -613,12 +673,13 @@ class PartitionTraversal(_Traversal):
 
     def enter(self, packets, cells):
         """As the base class says: partRays."""
-        met = self.frustum_meets(packets, cells)
-        old = np.where(met, self.state[packets], 0)
+        old = self.state[packets]
+        old = np.where(self.frustum_meets(packets, cells, old), old, 0)
         row, i = ranges(old)
         places = self.indices[packets[row], i]
         alive = self.test(packets[row], places, cells[row])
         self._count("box_tests", cells, old)
+        self._count("box_hits", cells[row], alive)
         new = np.bincount(row, alive, minlength=len(packets)).astype(np.int64)
         alive_before = np.cumsum(alive) - alive
         alive_before -= alive_before[(np.cumsum(old) - old)[row]] if len(row) else 0

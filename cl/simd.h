@@ -6,6 +6,7 @@
 // seven; both forms round once, so results are equal bit for bit.
 //
 //   FMA(a, b, c), FMA16(a, b, c)   a * b + c, rounded once
+//   FMA4(a, b, c), MASK4(m)        the same for float4 and int4
 //   SQRT16(v)                      square roots, correctly rounded
 //   MASK16(m)                      bit i: lane i of a comparison's result (0 or -1)
 //   COUNT16(mask), COUNT64(mask)   number of bits set
@@ -22,6 +23,7 @@
 //   TRANSPOSE16(s, x, y, z, w)     sixteen float4 s[] as four float16 rows
 //   CONVERT(T, v)                  lane by lane, as a cast
 //   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
+//   STORE_UNALIGNED_QUAD(p, v)     v an uint4
 //   PREFETCH(p)                    the line at p will be read
 //   STORE_STREAMING(T, p, v)       to global memory aligned to T, past the caches
 //
@@ -31,6 +33,8 @@
 
 #define X86_BUILTINS
 #define FMA(a, b, c) __builtin_fmaf(a, b, c)
+#define FMA4(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
+#define MASK4(m) ((uint)__builtin_ia32_movmskps(as_float4(m)))
 #define COUNT16(mask) ((uint)__builtin_popcount(mask))
 #define COUNT64(mask) ((uint)__builtin_popcountl(mask))
 #define LOWEST(mask) ((uint)__builtin_ctz(mask))
@@ -85,6 +89,7 @@ inline uint MASK16(int16 m)
 #else
 
 #define FMA(a, b, c) fma(a, b, c)
+#define FMA4(a, b, c) fma(a, b, c)
 #define FMA16(a, b, c) fma(a, b, c)
 #define SQRT16(v) sqrt(v)
 
@@ -96,6 +101,12 @@ inline uint MASK16(int16 m)
     const int8 a = bits.lo | bits.hi;
     const int4 b = a.lo | a.hi;
     return (uint)((b.x | b.y) | (b.z | b.w));
+}
+
+inline uint MASK4(int4 m)
+{
+    const int4 bits = m & (int4)(1, 2, 4, 8);
+    return (uint)((bits.x | bits.y) | (bits.z | bits.w));
 }
 
 #define COUNT16(mask) popcount((uint)(mask))
@@ -142,6 +153,8 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define STORE_UNALIGNED(T, p, v)                                                                   \
     (((global struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value = (v))
 
+#define STORE_UNALIGNED_QUAD(p, v) STORE_UNALIGNED(uint4, p, v)
+
 // Within each 128-bit lane, four rows of four become four columns.
 #define LOW_QUADS(a, b)                                                                            \
     __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29)
@@ -173,6 +186,7 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define CONVERT_(T, v) convert_##T(v)
 #define LOAD_UNALIGNED(T, p) vload16(0, p)
 #define STORE_UNALIGNED(T, p, v) vstore16(v, 0, p)
+#define STORE_UNALIGNED_QUAD(p, v) vstore4(v, 0, p)
 
 #define TRANSPOSE16(s, to_x, to_y, to_z, to_w)                                                     \
     {                                                                                              \

@@ -16,7 +16,7 @@ from raystream.camera import Camera
 from raystream.device import default_device, devices
 from raystream.errors import BuildError, DeviceError
 from raystream.light import PointLight
-from raystream.renderer import Renderer, parse_method
+from raystream.renderer import PRIMARY_VISIBILITY, Renderer, parse_method
 from raystream.scene import load_scene
 from raystream.tracer import methods
 
@@ -29,6 +29,9 @@ PROCEDURAL = {
     "gears": scenes.gears,
     "balls": scenes.balls,
     "mountain": scenes.mountain,
+    "room": scenes.room,
+    "toys": scenes.toys,
+    "meadow": scenes.meadow,
 }
 _VECTOR_OPTIONS = ("--eye", "--target", "--up", "--light", "--mirror-ball")
 _BAD_INPUT = 2
@@ -106,6 +109,12 @@ def _add_render(commands):
         "--method", default="crsh", help=f"one of {', '.join(methods())}; {_METHOD_HELP}"
     )
     command.add_argument("--samples", type=int, default=1, help="samples per pixel")
+    command.add_argument(
+        "--primary",
+        choices=PRIMARY_VISIBILITY,
+        default="raster",
+        help="find what the camera sees by rasterisation or by the method's rays",
+    )
     command.add_argument(
         "--verify",
         action="store_true",
@@ -240,9 +249,11 @@ def _render(options):
             options.bounces,
             samples=options.samples,
             progress=lambda _done, _all: bar.update(),
+            primary=options.primary,
         )
     frame.save(options.output)
-    print(f"{options.output}: {frame.statistics.rays} secondary rays, {options.method}")
+    kind = "rays" if options.primary == "trace" else "secondary rays"
+    print(f"{options.output}: {frame.statistics.rays} {kind}, {options.method}")
     if not options.verify:
         return 0
     results, _ = _results([(options.method, method, method_options)], options, scene, camera)

@@ -14,11 +14,10 @@ from raystream.baselines.tolerance import (
     ssim,
 )
 from raystream.image import to_srgb
-from raystream.renderer import SHADOW, Frame, Renderer, parse_method
+from raystream.renderer import PRIMARY, SHADOW, Frame, Renderer, parse_method
 from raystream.tracer import Tracer, methods
 
 EMBREE = "embree"
-PRIMARY = "primary"
 SECONDARY = "reflection and refraction"
 KINDS = (PRIMARY, SECONDARY, SHADOW)
 PRIMARY_SHARE = 1e-3  # rasterised pixels that may show another triangle than Embree's ray
@@ -132,7 +131,8 @@ class CheckedTracer(Tracer):
         prim_id = np.where(hit, flat - self.scene.first_prims[geom_id], -1)
         ours = _Hits(hits.t.get()[active], prim_id, geom_id)
         reference = self._embree.intersect(*rays)
-        self.checks[SECONDARY].add(differing(ours, reference, *self._triangles(), *rays))
+        kind = PRIMARY if stream.primary else SECONDARY
+        self.checks[kind].add(differing(ours, reference, *self._triangles(), *rays))
         return hits
 
     def occluded_stream(self, session, stream):

@@ -23,12 +23,15 @@ class Rays:
         (width, height) where ray i belongs to pixel i of a screen, row by row from the top.
     light : int or None
         Of shadow rays that all start at one light: its number.
+    primary : bool
+        Whether these are a camera's rays.
     """
 
     org_tnear: cla.Array
     dir_tfar: cla.Array
     size: tuple | None = None
     light: int | None = None
+    primary: bool = False
 
     def __len__(self):
         return self.org_tnear.shape[0]
@@ -127,7 +130,7 @@ def from_camera(session, camera, size, offset=(0.5, 0.5)):
         dir_tfar,
         local=_LOCAL,
     )
-    return Rays(org_tnear, dir_tfar, tuple(size))
+    return Rays(org_tnear, dir_tfar, tuple(size), primary=True)
 
 
 def float4(vector):

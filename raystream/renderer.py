@@ -19,6 +19,8 @@ from raystream.statistics import SHADING, Statistics
 from raystream.tracer import Tracer
 
 SHADOW, REFLECTION, REFRACTION = RAY_KINDS = ("shadow", "reflection", "refraction")
+PRIMARY = "primary"
+PRIMARY_VISIBILITY = ("raster", "trace")
 # The R2 sequence (Roberts 2018): sample k of a pixel is frac(1/2 + k * these), sample 0 its centre.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
 
@@ -38,7 +40,8 @@ class Frame:
     statistics : raystream.statistics.Statistics
         Summed over all ray streams of the frame, with the times of all stages.
     kinds : dict of str to raystream.statistics.Statistics
-        The same by kind of ray, "shadow", "reflection" and "refraction", for kinds that had rays.
+        The same by kind of ray, "primary" (where traced), "shadow", "reflection" and "refraction",
+        for kinds that had rays.
         Stage times only where `Renderer.render` was asked for them.
     """
 
@@ -64,6 +67,7 @@ def render(
     samples=1,
     device=None,
     progress=None,
+    primary="raster",
     **options,
 ):
     """Render a scene: see `Renderer`, which keeps its state between frames.
@@ -86,6 +90,8 @@ def render(
     device : pyopencl.Device, optional
     progress : callable, optional
         Called with (samples done, samples) after each sample.
+    primary : {"raster", "trace"}
+        How to find what the camera sees: by rasterisation, or by the method's rays.
     **options
         Of the method, and `memory_limit`.
 
@@ -100,7 +106,9 @@ def render(
     """
     scene = as_scene(scene)
     renderer = Renderer(scene, method, device, **options)
-    return renderer.render(camera, size, max_bounces, shadows, samples, progress)
+    return renderer.render(
+        camera, size, max_bounces, shadows, samples, progress, primary=primary
+    )
 
 
 class Renderer:
@@ -136,6 +144,7 @@ class Renderer:
         samples=1,
         progress=None,
         stages_by_kind=False,
+        primary="raster",
     ):
         """Render one frame; parameters and result as for `raystream.render`.
 
@@ -151,6 +160,7 @@ class Renderer:
         width, height = check_size(size)
         check_count("max_bounces", max_bounces, least=0)
         check_count("samples", samples)
+        check_choice("primary", primary, PRIMARY_VISIBILITY)
         if isinstance(self._tracer, Tracer):
             self._tracer.geometry(self._session)  # takes vertices updated since the last frame
         counts = _Counts(self._session, self.scene.num_triangles, stages_by_kind)
@@ -160,9 +170,12 @@ class Renderer:
         visible = None
         for sample in range(samples):
             offset = (0.5 + sample * _R2) % 1.0
-            hits = self._sample(
-                camera, (width, height), offset, max_bounces, shadows, image, counts
-            )
+            view = rays.from_camera(self._session, camera, (width, height), offset)
+            if primary == "trace":
+                hits = counts.trace(PRIMARY, self._tracer, self._tracer.intersect_stream, view)
+            else:
+                hits = self._rasterize(camera, (width, height), offset)
+            self._sample(view, hits, max_bounces, shadows, image, counts)
             visible = visible or self._visible(hits)
             counts.take_stages()
             if progress is not None:
@@ -171,13 +184,11 @@ class Renderer:
         visible = [field.reshape(height, width) for field in visible]
         return Frame(np.ascontiguousarray(linear), *visible, counts.total, counts.kinds())
 
-    def _sample(self, camera, size, offset, max_bounces, shadows, image, counts):
-        """Add one sample per pixel to the image; returns the primary hits."""
+    def _sample(self, stream, hits, max_bounces, shadows, image, counts):
+        """Add one sample per pixel to the image, given the camera's rays and their hits."""
         session, shader = self._session, self._shader
-        stream = rays.from_camera(session, camera, size, offset)
         weights = session.empty((len(stream), 4), np.float32)
         session.fill(SHADING, weights, 1)
-        primary = hits = self._rasterize(camera, size, offset)
         pending, bounce = [], 0
         while True:
             surfaces = shader.evaluate(hits, stream, weights, image)
@@ -188,7 +199,7 @@ class Renderer:
                 spawned = ((REFRACTION, *refracted), (REFLECTION, *reflected))
                 pending += [(kind, r, w, bounce + 1) for kind, r, w, alive in spawned if alive]
             if not pending:
-                return primary
+                return
             kind, stream, weights, bounce = pending.pop()
             hits = counts.trace(kind, self._tracer, self._tracer.intersect_stream, stream)
 
@@ -220,7 +231,7 @@ class _Counts:
     def __init__(self, session, triangles, stages_by_kind):
         self.total = Statistics(triangles=triangles)
         self._session, self._stages_by_kind = session, stages_by_kind
-        self._by_kind = {kind: Statistics(triangles=triangles) for kind in RAY_KINDS}
+        self._by_kind = {kind: Statistics(triangles=triangles) for kind in (PRIMARY, *RAY_KINDS)}
 
     def kinds(self):
         """The statistics of the kinds that had rays."""

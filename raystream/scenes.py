@@ -1,4 +1,4 @@
-"""Scenes made by formula: Cornell box, a curved mirror, a demo, and those of spd.py."""
+"""Scenes made by formula: boxes, mirrors, a demo; those of spd.py and packet_scenes.py."""
 
 import numpy as np
 
@@ -8,18 +8,24 @@ from raystream.checks import check_choice, check_count, check_number, check_vect
 from raystream.light import PointLight
 from raystream.material import Material
 from raystream.mesh import Mesh, from_shape
+from raystream.packet_scenes import all_reflective, all_refractive, meadow, room, toys
 from raystream.scene import Scene
 from raystream.spd import balls, gears, mountain, rings
 
 __all__ = [
+    "all_reflective",
+    "all_refractive",
     "balls",
     "bumpy_mirror",
     "cornell",
     "demo",
     "gears",
+    "meadow",
     "mirror_ball",
     "mountain",
     "rings",
+    "room",
+    "toys",
 ]
 
 _SMOOTH_LEVEL = 5  # subdivisions of a ball whose outline shows no corners: 20 480 triangles

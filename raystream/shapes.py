@@ -209,6 +209,38 @@ def icosphere(subdivisions):
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
 
 
+def rounded_box(half, radius, steps):
+    """A box around the origin with round edges and corners, 12 * (2 * steps + 1)^2 triangles.
+
+    Parameters
+    ----------
+    half : (3,) float
+        Half the size along x, y and z.
+    radius : float
+        Of edges and corners, below every half size.
+    steps : int
+        Cells from a flat side to the middle of an edge.
+    """
+    half = np.asarray(half, dtype=np.float64)
+    bend = radius * np.tan(np.linspace(0, np.pi / 4, steps + 1))
+    bend[-1] = radius  # to the bit, so that the sides meet
+    lines = [np.concatenate([-(h - radius) - bend[::-1], h - radius + bend]) for h in half]
+    cells = 2 * steps + 1
+    vertices, faces = [], []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for side in (-1, 1):
+            grid = np.empty((cells + 1, cells + 1, 3))
+            grid[..., u], grid[..., v] = np.meshgrid(lines[u], lines[v])
+            grid[..., axis] = side * half[axis]
+            order = slice(None, None, side)
+            faces.append(grid_faces(cells, cells)[:, order] + len(vertices) * (cells + 1) ** 2)
+            vertices.append(grid.reshape(-1, 3))
+    vertices = np.concatenate(vertices)
+    inner = np.clip(vertices, radius - half, half - radius)
+    return inner + radius * unit(vertices - inner), np.concatenate(faces)
+
+
 def _subdivide(vertices, faces):
     """Split every triangle into four at its edges' midpoints, which neighbours share."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 
 # Stage names, as in the papers.
 GEOMETRY = "geometry"
@@ -15,6 +16,11 @@ TRAVERSAL = "traversal"
 STREAM_REDUCTION = "stream reduction"
 FINAL_INTERSECTION = "final intersection"
 SHADING = "shading"
+
+
+_SUMMED = (
+    "mesh_tests", "final_tests", "final_hits", "rays", "batches", "packets", "simd_rays"
+)  # fmt: skip
 
 
 @dataclasses.dataclass
@@ -40,6 +46,10 @@ class Statistics:
         What the method has built of the scene, to be kept for a frame (`ldc`: the cube).
     texels : int
         Texels of the structure's images (`ldc`).
+    packets, simd_rays : int
+        Packets that hold rays, and the SIMD rays of which these are made (`packet`).
+    by_depth : dict of str to list of int
+        Counts by depth in the hierarchy, the root first; see raystream.packet.COUNTERS (`packet`).
     stages : dict of str to dict
         Per stage ``device`` seconds (kernels running) and ``wall`` seconds (with launch gaps).
     """
@@ -54,12 +64,21 @@ class Statistics:
     batches: int = 0
     structure_bytes: int = 0
     texels: int = 0
+    packets: int = 0
+    simd_rays: int = 0
+    by_depth: dict = dataclasses.field(default_factory=dict)
     stages: dict = dataclasses.field(default_factory=dict)
 
     @property
     def total_tests(self):
         """Sum of mesh tests, level tests and final tests."""
         return self.mesh_tests + self.final_tests + sum(level["tests"] for level in self.levels)
+
+    @property
+    def tests_by_depth(self):
+        """Tests of SIMD rays against boxes and triangles by depth in the hierarchy (`packet`)."""
+        kinds = (self.by_depth.get(name, []) for name in ("box_tests", "triangle_tests"))
+        return [boxes + triangles for boxes, triangles in zip(*kinds, strict=True)]
 
     @property
     def bytes_per_triangle(self):
@@ -73,7 +92,7 @@ class Statistics:
 
     def to_dict(self):
         """The attributes and what is derived from them, as plain Python objects."""
-        derived = ("total_tests", "bytes_per_triangle", "bytes_per_texel")
+        derived = ("total_tests", "tests_by_depth", "bytes_per_triangle", "bytes_per_texel")
         return {**dataclasses.asdict(self), **{name: getattr(self, name) for name in derived}}
 
     def add(self, other):
@@ -81,7 +100,7 @@ class Statistics:
 
         Levels are matched from the leaves up, since streams differ in their number of levels.
         """
-        for name in ("mesh_tests", "final_tests", "final_hits", "rays", "batches"):
+        for name in _SUMMED:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("triangles", "peak_stream_bytes", "structure_bytes", "texels"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
@@ -91,6 +110,9 @@ class Statistics:
         for mine, theirs in zip(reversed(self.levels), reversed(other.levels), strict=False):
             for key in empty:
                 mine[key] += theirs[key]
+        for name, counts in other.by_depth.items():
+            pairs = itertools.zip_longest(self.by_depth.get(name, []), counts, fillvalue=0)
+            self.by_depth[name] = [a + b for a, b in pairs]
         for stage, seconds in other.stages.items():
             mine = self.stages.setdefault(stage, {"wall": 0.0, "device": 0.0})
             for key in mine:

@@ -15,6 +15,7 @@ from raystream.checks import as_float_array, check_choice, check_count, check_ro
 from raystream.crsh import CoherentTracer
 from raystream.geometry import Geometry
 from raystream.ldc import LayeredDepthCubeTracer
+from raystream.packet import PacketTracer
 from raystream.rsh import RayspaceTracer
 from raystream.scene import as_scene
 from raystream.statistics import Statistics
@@ -24,6 +25,7 @@ _METHODS = {
     "rsh": RayspaceTracer,
     "crsh": CoherentTracer,
     "ldc": LayeredDepthCubeTracer,
+    "packet": PacketTracer,
 }
 _COMMON = ("self", "session", "geometry", "memory_limit")
 # The default memory_limit: a part of the device's memory, and no more than needed to be fast.
@@ -74,7 +76,7 @@ class Tracer:
         memory where that is less.
     **options
         Of the method: see `raystream.rsh.RayspaceTracer`, `raystream.crsh.CoherentTracer`,
-        `raystream.ldc.LayeredDepthCubeTracer`.
+        `raystream.ldc.LayeredDepthCubeTracer`, `raystream.packet.PacketTracer`.
 
     Attributes
     ----------

@@ -40,3 +40,26 @@ def test_times_of_the_layered_depth_cube_are_whole():
             assert below[key] == above[key]
         for key in ("construction_ms", "tracing_ms"):
             assert 1 < int(above[key]) / int(below[key]) < 4
+
+
+def packet_table(scene):
+    """Table 2 of Overbeck et al. for a scene: quantity to value."""
+    with open(FOLDER / "packets08.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    return {r["quantity"]: r["value"] for r in table
+            if (r["scene"], r["place"]) == (scene, "table 2")}  # fmt: skip
+
+
+@pytest.mark.parametrize("scene", ["toasters", "fairy", "bart-museum", "bart-kitchen"])
+def test_the_benefit_of_large_packets_is_the_ratio_of_the_frame_rates(scene):
+    table = packet_table(scene)
+    assert len(table) == 5
+    large, small, benefit = (
+        float(table[name])
+        for name in ("16x16 ray packets", "2x2 SIMD ray packets", "performance benefit")
+    )
+    # the printed digits are rounded: a rate is off by up to 0.05, "4" by up to 0.5
+    slack = 0.5 if table["16x16 ray packets"] == "4" else 0.05
+    assert (large - slack) / (small + 0.05) <= benefit <= (large + slack) / (small - 0.05)
+    assert 1 < float(table["culling benefit"]) < 2
+    assert table["traversal of reflected and refracted rays"] in ("ranged", "partition")

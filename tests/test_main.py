@@ -26,7 +26,17 @@ def test_render_writes_a_picture(capsys, tmp_path):
     )  # fmt: skip
     assert (code, err) == (0, "")
     assert np.load(path).shape == (10, 20, 3)
-    assert str(path) in out
+    assert str(path) in out and "secondary rays" in out
+
+
+def test_render_traces_primary_rays_where_asked(capsys, tmp_path):
+    code, out, err = run(
+        capsys, "render", "cornell", "-o", tmp_path / "a.npy", "--size", "20x10", "--bounces", 0,
+        "--method", "packet:traversal=ranged", "--primary", "trace",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    frame = rs.render(rs.scenes.cornell(), size=(20, 10), max_bounces=0, primary="trace")
+    assert f"{frame.statistics.rays} rays, packet" in out
 
 
 def test_vectors_may_begin_with_a_minus(capsys, tmp_path):
@@ -123,6 +133,7 @@ def test_devices_marks_the_default(capsys):
     (["render", "cornell", "-o", "a.png", "--mirror", "nothing*"], "nothing*"),
     (["render", "cornell", "-o", "a.png", "--bounces", "-1"], "max_bounces"),
     (["render", "cornell", "-o", "a.png", "--samples", "0"], "samples"),
+    (["render", "cornell", "-o", "a.png", "--primary", "rays"], "invalid choice: 'rays'"),
     (["render", "cornell:heavy", "-o", "a.png"], "variant"),
     (["render", "rings:0", "-o", "a.png"], "size"),
     (["render", "cornell", "-o", "a.png", "--method", "rsh:arity"], "need key=value"),

@@ -301,6 +301,43 @@ def _tile(tile_x, tile_y, size, rays):
     return [simd for simd in lanes if simd]
 
 
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize("traversal", TRAVERSALS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_wide_simd_rays(kind, traversal, precision):
+    """SIMD rays of 4 x 4: the same hits, and the counts of four times as wide ones."""
+    options = {"traversal": traversal, "precision": precision, "packet_size": 8}
+    origins, directions, keywords = rays_of(kind)
+    wide, narrow = (PacketTracer(*scene(), **options, simd_width=width) for width in (16, 4))
+    hits, same = (t.intersect(origins, directions, **keywords) for t in (wide, narrow))
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(hits, name), getattr(same, name), name)
+    if precision == "double":
+        np.testing.assert_array_equal(hits.t, exact(kind).t)
+    ours, theirs = wide.statistics, narrow.statistics
+    assert (ours.rays, ours.packets, ours.hits) == (theirs.rays, theirs.packets, theirs.hits)
+    np.testing.assert_array_equal(ours.visits_by_depth, theirs.visits_by_depth)
+    np.testing.assert_array_equal(ours.leaves_by_depth, theirs.leaves_by_depth)
+    assert (ours.alive_by_depth <= theirs.alive_by_depth).all()
+    assert (theirs.alive_by_depth <= 4 * ours.alive_by_depth).all()
+    assert (ours.box_hits_by_depth <= ours.box_tests_by_depth).all()
+
+
+@pytest.mark.parametrize("traversal", TRAVERSALS)
+def test_frusta_are_asked_where_enough_rays_are_active(traversal):
+    origins, directions, keywords = rays_of("primary")
+    asked = []
+    for least_active in (1, 3, 16, 65):
+        tracer = PacketTracer(*scene(), traversal=traversal, least_active=least_active)
+        hits = tracer.intersect(origins, directions, **keywords)
+        np.testing.assert_array_equal(hits.t, exact("primary").t)
+        counts = tracer.statistics
+        asked.append(
+            int((counts.frustum_box_tests_by_depth + counts.frustum_triangle_tests_by_depth).sum())
+        )
+    assert asked[0] > asked[1] >= asked[2] > asked[3] == 0
+
+
 def all_counts(kind, packet_size, culling, query):
     return {name: traced(kind, name, packet_size, culling)[2 + query] for name in TRAVERSALS}
 
@@ -490,6 +527,9 @@ def test_update_vertices():
         ({"traversal": "sorted"}, "traversal: need one of masked, ranged, partition"),
         ({"packet_size": 3}, "packet_size: need one of"),
         ({"packet_size": "16"}, "packet_size: need one of"),
+        ({"simd_width": 8}, "simd_width: need one of"),
+        ({"simd_width": 16, "packet_size": 2}, "simd_width: need one of"),
+        ({"precision": "half"}, "precision: need one of double, single"),
     ],
 )
 def test_refused_options(change, message):

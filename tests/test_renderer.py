@@ -191,6 +191,23 @@ def test_statistics_and_stages_of_a_frame():
 COUNTS = ("rays", "mesh_tests", "final_tests", "final_hits", "total_tests")
 
 
+def test_traced_primary_visibility_is_that_of_the_rasteriser():
+    scene = rs.scenes.demo()
+    raster, traced = (
+        rs.render(scene, size=(64, 48), method="packet", primary=primary)
+        for primary in ("raster", "trace")
+    )
+    assert (raster.prim_id == traced.prim_id).mean() > 0.999
+    same = raster.prim_id == traced.prim_id
+    np.testing.assert_allclose(raster.depth[same], traced.depth[same], rtol=1e-5)
+    assert psnr(traced.image, raster.image) > 40
+    assert list(traced.kinds) == ["primary", *RAY_KINDS] and list(raster.kinds) == list(RAY_KINDS)
+    assert traced.kinds["primary"].rays == 64 * 48
+    assert "rasterisation" not in traced.statistics.stages
+    twice = rs.render(scene, size=(64, 48), samples=2, primary="trace")
+    assert twice.kinds["primary"].rays == 2 * 64 * 48
+
+
 @pytest.mark.parametrize("options", [{}, {"arity": 8, "levels": 2}, {"method": "brute"}], ids=str)
 def test_the_kinds_of_ray_add_up_to_the_frame(options):
     frame = rs.render(rs.scenes.demo(), size=(48, 32), max_bounces=3, samples=2, **options)
@@ -297,6 +314,7 @@ def test_samples_are_averaged_and_reported():
     ({"method": "bvh"}, ValueError, "method: need one of"),
     ({"method": 3}, TypeError, "method: need a name or a tracer, got int"),
     ({"arity": 5}, ValueError, "arity"),
+    ({"primary": "rays"}, ValueError, "primary: need one of 'raster', 'trace', got 'rays'"),
 ])  # fmt: skip
 def test_bad_arguments_are_refused(arguments, error, message):
     with pytest.raises(error, match=message):

@@ -22,6 +22,9 @@ from raystream.scene import load_scene
         (lambda: scenes.mountain(6), 13_312),
         (lambda: scenes.mountain(1), 8 + 4 * 1280),
         (lambda: scenes.balls(0), 82),
+        (lambda: scenes.room(), 804),
+        (lambda: scenes.toys(), 11_208),
+        (lambda: scenes.meadow(), 172_688),
     ],
 )
 def test_triangle_counts(make, count):
@@ -80,6 +83,9 @@ ALL = {
     "balls": lambda: scenes.balls(2),
     "mountain": lambda: scenes.mountain(4),
     "demo": lambda: scenes.demo(),
+    "room": lambda: scenes.room(),
+    "toys": lambda: scenes.toys(),
+    "meadow": lambda: scenes.meadow(),
 }
 
 
