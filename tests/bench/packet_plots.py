@@ -41,7 +41,7 @@ def _draw_panels(path, rows, lines):
     for panel in panels[-1]:
         panel.set_xlabel("packet size")
     handles = panels[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=min(len(lines), 2 + len(scenes)))
+    figure.legend(*handles, loc="outside lower center", ncols=min(len(lines), 1 + len(scenes)))
     figure.savefig(path, dpi=90)
     plt.close(figure)
 
