@@ -8,7 +8,7 @@
 // without a screen as many in the order of the rays. SIMD rays without a live lane are left out. One work-item
 // takes one packet after another; its stack and its rays are private.
 //
-// Build-time constants: WIDTH (4 or 16), DEPTH (levels of the tree at most), NUM_COUNTERS, MASKED, RANGED,
+// Build-time constants: WIDTH (4 or 16), DEPTH (levels of the tree at most), LEAF_SIZE, NUM_COUNTERS, MASKED, RANGED,
 // PARTITION.
 
 #include "frustum.h"

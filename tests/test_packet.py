@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from raystream.baselines import PacketTracer
@@ -15,7 +16,6 @@ from raystream import device
 from raystream.errors import MemoryLimitError
 from raystream.packet import COUNTERS, PACKET_SIZES, TRAVERSALS
 from raystream.rays import Rays
-from raystream.scenes import mirror_ball
 
 SIZE = (45, 34)  # no multiple of any packet but the smallest
 KINDS = ("primary", "shadow", "reflection", "refraction", "in order")
@@ -27,13 +27,15 @@ COUNTED = [((2, 4), 1), ((16, 4), 1), ((16, 16), 0), ((16, 16), 6), ((32, 16), 1
 
 @functools.cache
 def scene():
-    """A mirror ball and triangles of several sizes, some without an area, in two meshes."""
+    """A ball and triangles of several sizes, some without an area, in two meshes."""
     rng = np.random.default_rng(7)
     corners = rng.uniform(-3, 3, (300, 1, 3)) + rng.normal(size=(300, 3, 3)) * rng.choice(
         [0.05, 0.4, 2.0], (300, 1, 1)
     )
     corners[::10, 2] = corners[::10, 1]
-    return rs.Scene([mirror_ball((0, 0, 0), 1.0), mesh_of("soup", corners.astype(np.float32))])
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    meshes = [rs.Mesh(ball.vertices, ball.faces), mesh_of("soup", corners.astype(np.float32))]
+    return rs.Scene(meshes)
 
 
 def camera():
@@ -42,14 +44,16 @@ def camera():
 
 @functools.cache
 def rays_of(kind):
-    """Origins, directions, tnear and tfar of one kind of ray, a ray for each pixel.
+    """Origins, directions, tnear and tfar of one kind of ray.
 
-    Pixels without a ray have tfar < tnear.
+    A ray for each pixel, those without a ray have tfar < tnear; "in order" has no pixels.
     """
     count = SIZE[0] * SIZE[1]
     origins, directions = camera().rays(SIZE)
     tnear, tfar = np.zeros(count), np.full(count, np.inf)
     if kind == "in order":
+        count = 601
+        tnear, tfar = tnear[:count], tfar[:count]
         origins, directions = random_rays(np.random.default_rng(1), count)
         tfar[::7] = np.random.default_rng(2).random(len(tfar[::7]))
     if kind in ("shadow", "reflection", "refraction"):
@@ -129,7 +133,7 @@ def test_the_hits_of_brute_force(kind, traversal, shape, least_active):
     for name, values in hits.items():
         np.testing.assert_array_equal(values, reference[name], name)
     np.testing.assert_array_equal(blocked, shadowed)
-    assert counts.final_hits == np.isfinite(reference["t"]).sum() > 100
+    assert counts.final_hits == np.isfinite(reference["t"]).sum() > 50
 
 
 def assert_same_counts(ours, theirs):
@@ -288,5 +292,5 @@ def test_refused_options(options, message):
 
 def test_memory_limit():
     tracer = rs.Tracer(scene(), "packet", memory_limit=1000)
-    with pytest.raises(MemoryLimitError, match="hierarchy of .* triangles: need .* limit is 1000"):
+    with pytest.raises(MemoryLimitError, match="hierarchy of .* need .*, memory_limit is 1000"):
         tracer.intersect([[0, 0, 0]], [[0, 0, 1]])
