@@ -117,15 +117,21 @@ def sizes_study(name, options):
 
 
 def culling_study(name, options):
-    """Seconds of Partition by kind of ray and packet size, with and without frusta."""
+    """Seconds of Partition with and without frusta: in the paper's set-up, and in the default."""
     scene = load(name, options.folder)
+    columns = [(setup, culling) for setup in ("paper", "default") for culling in (True, False)]
     for kind, streams in ray_kinds(scene, options.size).items():
         for size in tqdm(PACKET_SIZES[1:], f"{name}, {kind}", disable=None, leave=False):
             tracers = [rs.Tracer(scene, "packet", traversal="partition", packet_size=size,
-                                 frustum_culling=culling) for culling in (True, False)]  # fmt: skip
-            on, off = best_in_turn(tracers, kind, streams, options.repeats)
-            yield {"scene": name, "kind": kind, "packet size": size, "with frusta": on,
-                   "without": off, "benefit": off / on}  # fmt: skip
+                                 frustum_culling=culling, **(PAPER if setup == "paper" else {}))
+                       for setup, culling in columns]  # fmt: skip
+            seconds = best_in_turn(tracers, kind, streams, options.repeats)
+            row = {"scene": name, "kind": kind, "packet size": size}
+            for (setup, culling), best in zip(columns, seconds, strict=True):
+                row[f"{setup}, {'with' if culling else 'without'} frusta"] = best
+            row["paper, benefit"] = seconds[1] / seconds[0]
+            row["default, benefit"] = seconds[3] / seconds[2]
+            yield row
 
 
 # --- Figure 6 ---

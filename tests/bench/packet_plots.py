@@ -15,11 +15,11 @@ def draw_sizes(path, rows):
 
 
 def draw_culling(path, rows):
-    """Figure 7: as figure 5, Partition with and without frusta."""
-    color = _COLOURS["partition"]
+    """Figure 7: as figure 5, Partition with and without frusta, in the paper's set-up and ours."""
     lines = {
-        "with frusta": ("with frusta", {}, color, "-"),
-        "without": ("without", {}, color, "--"),
+        f"{setup}, {frusta} frusta": (f"{setup}, {frusta} frusta", {}, color, style)
+        for setup, color in (("paper", "#444444"), ("default", _COLOURS["partition"]))
+        for frusta, style in (("with", "-"), ("without", "--"))
     }
     _draw_panels(path, rows, lines)
 
@@ -41,7 +41,7 @@ def _draw_panels(path, rows, lines):
     for panel in panels[-1]:
         panel.set_xlabel("packet size")
     handles = panels[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=len(lines))
+    figure.legend(*handles, loc="outside lower center", ncols=min(len(lines), 1 + len(scenes)))
     figure.savefig(path, dpi=90)
     plt.close(figure)
 
@@ -54,7 +54,7 @@ def _draw_lines(panel, rows, lines):
         times = [1e3 * float(r[column]) for r in chosen]
         panel.plot(range(len(sizes)), times, style, color=color, marker=".", label=label)
         highest[label] = max(times)
-    if "masked" in highest:  # its times explode; the others' differences are to be seen
+    if "masked" in highest:  # its times grow so far that no difference of the others is seen
         others = max(value for label, value in highest.items() if label != "masked")
         panel.set_ylim(0, min(1.08 * max(highest.values()), 1.6 * others))
     panel.set_ylim(bottom=0)
