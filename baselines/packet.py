@@ -44,7 +44,7 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from . import single
+from . import watertight_single
 from .arrays import float32_rays
 from .bvh import build_bvh, ranges
 from .frustum import PacketRays, bound_packets
@@ -169,7 +169,7 @@ class PacketTracer(HostTracer):
         The frustum is asked where at least so many SIMD rays are active; 1: always, as in the
         paper.
     precision : {"double", "single"}
-        Of the triangle test: watertight.py, or single.py, whose hits are those of the device.
+        Of the triangle test: watertight.py, or watertight_single.py, whose hits are those of the device.
 
     Raises
     ------
@@ -403,7 +403,7 @@ class _SimdRays:
         origins, directions = self.origins[simd, lane], self.directions[simd, lane]
         tnear, tfar = self.tnear[simd, lane], self.tfar[simd, lane]
         if self.precision == "single":
-            return single.intersect_pairs(origins, directions, corners, tnear, tfar)
+            return watertight_single.intersect_pairs(origins, directions, corners, tnear, tfar)
         hit, t, u, v = intersect_pairs(
             *(values.astype(np.float64) for values in (origins, directions, corners))
         )

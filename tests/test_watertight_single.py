@@ -5,7 +5,7 @@ import ctypes.util
 
 import numpy as np
 import pytest
-from raystream.baselines import single
+from raystream.baselines import watertight_single as single
 from raystream.baselines.brute_force import BruteForceTracer
 from soup import random_rays, triangle_soup
 
