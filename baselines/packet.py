@@ -169,7 +169,7 @@ class PacketTracer(HostTracer):
         The frustum is asked where at least so many SIMD rays are active; 1: always, as in the
         paper.
     precision : {"double", "single"}
-        Of the triangle test: watertight.py, or watertight_single.py, whose hits are those of the device.
+        Of the triangle test: watertight.py, or watertight_single.py, whose hits are the device's.
 
     Raises
     ------

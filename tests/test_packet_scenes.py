@@ -78,12 +78,12 @@ def test_a_rounded_box_is_closed_and_keeps_its_size(steps):
 @pytest.mark.parametrize(
     "vary, name, field, share",
     [
-        (scenes.all_reflective, "toys-reflective", "reflectivity", 0.5),
-        (scenes.all_refractive, "toys-refractive", "transmission", 0.8),
+        (scenes.all_reflective, "meadow-reflective", "reflectivity", 0.5),
+        (scenes.all_refractive, "meadow-refractive", "transmission", 0.8),
     ],
 )
 def test_variants_change_all_materials_of_a_copy(vary, name, field, share):
-    scene = scenes.toys()
+    scene = scenes.meadow()  # has mirrors and glass, so that both are seen to go
     before = [mesh.material for mesh in scene.meshes]
     varied = vary(scene)
     assert [mesh.material for mesh in scene.meshes] == before
