@@ -1,4 +1,4 @@
-// Triangles and their bounds, gathered from the mesh once per frame.
+// Triangles, gathered from the mesh once per frame, and their bounds, for the methods that need them.
 //
 // Output layout:
 //   triangles  three float4 a triangle: v0, v1, v2, w unused
@@ -9,6 +9,8 @@
 // Spheres are minimal (design, section 5): the circumcircle's, or that of the longest edge where the
 // triangle is obtuse. The centre is rounded, so the radius is measured from the rounded centre to the
 // three vertices and enlarged by RADIUS_SLACK, more than the rounding of that distance.
+//
+// Build-time constant: GATHERED, triangles to a work-item.
 
 #include "bounds.h"
 #include "triangle.h"
@@ -81,27 +83,37 @@ inline float4 half_extents(float4 a, float4 b, float4 c, float4 sphere)
     return result;
 }
 
-// One work-item gathers one block of 16 triangles.
-kernel void gather_triangles(const uint num_triangles, global const float *restrict vertices,
-                             global const uint *restrict faces, global float4 *restrict triangles,
-                             global float4 *restrict bounds, global float *restrict bound_rows)
+// One work-item gathers GATHERED triangles; padding is zero.
+kernel void gather_triangles(const uint num_triangles, const uint padded,
+                             global const float *restrict vertices,
+                             global const uint *restrict faces, global float4 *restrict triangles)
+{
+    const uint begin = GATHERED * get_global_id(0), end = MIN(begin + GATHERED, padded);
+    for (uint i = begin; i < end; i++)
+        for (uint corner = 0; corner < 3; corner++) {
+            float4 v = 0.0f;
+            if (i < num_triangles) {
+                global const float *p = vertices + 3 * (ulong)faces[3 * (ulong)i + corner];
+                v = (float4)(p[0], p[1], p[2], 0.0f);
+            }
+            triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = v;
+        }
+}
+
+// One work-item bounds one block of 16 triangles.
+kernel void bound_triangles(const uint num_triangles, global const float4 *restrict triangles,
+                            global float4 *restrict bounds, global float *restrict bound_rows)
 {
     const uint block = get_global_id(0);
     for (uint lane = 0; lane < 16; lane++) {
         const uint i = block * 16 + lane;
-        float4 v[3] = {0.0f, 0.0f, 0.0f};
         float4 bound[BOUND_FLOAT4S] = {(float4)(0.0f, 0.0f, 0.0f, -INFINITY), 0.0f, 0.0f};
         if (i < num_triangles) {
-            for (uint corner = 0; corner < 3; corner++) {
-                global const float *p = vertices + 3 * (ulong)faces[3 * i + corner];
-                v[corner] = (float4)(p[0], p[1], p[2], 0.0f);
-            }
+            global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)i;
             bound[0] = bounding_sphere(v[0], v[1], v[2]);
             bound[1] = slab(v[0], v[1], v[2], bound[0]);
             bound[2] = half_extents(v[0], v[1], v[2], bound[0]);
         }
-        for (uint corner = 0; corner < 3; corner++)
-            triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = v[corner];
         for (uint part = 0; part < BOUND_FLOAT4S; part++) {
             bounds[BOUND_FLOAT4S * (ulong)i + part] = bound[part];
             global float *rows = bound_rows + 16 * (BOUND_ROWS * (ulong)block + 4 * part) + lane;

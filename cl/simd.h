@@ -5,10 +5,10 @@
 // PoCL compiles the built-in fma() to a call of its library, which costs brute force a factor of
 // seven; both forms round once, so results are equal bit for bit.
 //
-//   FMA(a, b, c), FMA16(a, b, c)   a * b + c, rounded once
+//   FMA(a, b, c), FMA8, FMA16      a * b + c, rounded once
 //   FMA4(a, b, c), MASK4(m)        the same for float4 and int4
 //   SQRT16(v)                      square roots, correctly rounded
-//   MASK16(m)                      bit i: lane i of a comparison's result (0 or -1)
+//   MASK8(m), MASK16(m)            bit i: lane i of a comparison's result (0 or -1)
 //   COUNT16(mask), COUNT64(mask)   number of bits set
 //   LOWEST(mask)                   number of the lowest bit set, of a mask that is not 0
 //   COMPRESS16(v, mask)            the lanes whose bit is set, moved to the front, the rest 0
@@ -24,6 +24,7 @@
 //   CONVERT(T, v)                  lane by lane, as a cast
 //   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
 //   STORE_UNALIGNED_QUAD(p, v)     v an uint4
+//   LOAD_PRIVATE(T, p), STORE_PRIVATE(T, p, v)         the same in private memory
 //   PREFETCH(p)                    the line at p will be read
 //   STORE_STREAMING(T, p, v)       to global memory aligned to T, past the caches
 //
@@ -35,6 +36,8 @@
 #define FMA(a, b, c) __builtin_fmaf(a, b, c)
 #define FMA4(a, b, c) __builtin_ia32_vfmaddps(a, b, c)
 #define MASK4(m) ((uint)__builtin_ia32_movmskps(as_float4(m)))
+#define FMA8(a, b, c) __builtin_ia32_vfmaddps256(a, b, c)
+#define MASK8(m) ((uint)__builtin_ia32_movmskps256(as_float8(m)))
 #define COUNT16(mask) ((uint)__builtin_popcount(mask))
 #define COUNT64(mask) ((uint)__builtin_popcountl(mask))
 #define LOWEST(mask) ((uint)__builtin_ctz(mask))
@@ -90,6 +93,7 @@ inline uint MASK16(int16 m)
 
 #define FMA(a, b, c) fma(a, b, c)
 #define FMA4(a, b, c) fma(a, b, c)
+#define FMA8(a, b, c) fma(a, b, c)
 #define FMA16(a, b, c) fma(a, b, c)
 #define SQRT16(v) sqrt(v)
 
@@ -107,6 +111,13 @@ inline uint MASK4(int4 m)
 {
     const int4 bits = m & (int4)(1, 2, 4, 8);
     return (uint)((bits.x | bits.y) | (bits.z | bits.w));
+}
+
+inline uint MASK8(int8 m)
+{
+    const int8 bits = m & (int8)(1, 2, 4, 8, 16, 32, 64, 128);
+    const int4 a = bits.lo | bits.hi;
+    return (uint)((a.x | a.y) | (a.z | a.w));
 }
 
 #define COUNT16(mask) popcount((uint)(mask))
@@ -154,6 +165,10 @@ inline ulong TEST64(global const uchar *p, uint bit)
     (((global struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value = (v))
 
 #define STORE_UNALIGNED_QUAD(p, v) STORE_UNALIGNED(uint4, p, v)
+#define LOAD_PRIVATE(T, p)                                                                         \
+    (((const struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value)
+#define STORE_PRIVATE(T, p, v)                                                                     \
+    (((struct __attribute__((packed, aligned(1))) { T value; } *)(p))->value = (v))
 
 // Within each 128-bit lane, four rows of four become four columns.
 #define LOW_QUADS(a, b)                                                                            \
@@ -185,6 +200,8 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define PREFETCH(p) prefetch(p, 1)
 #define CONVERT_(T, v) convert_##T(v)
 #define LOAD_UNALIGNED(T, p) vload16(0, p)
+#define LOAD_PRIVATE(T, p) vload16(0, p)
+#define STORE_PRIVATE(T, p, v) vstore16(v, 0, p)
 #define STORE_UNALIGNED(T, p, v) vstore16(v, 0, p)
 #define STORE_UNALIGNED_QUAD(p, v) vstore4(v, 0, p)
 

@@ -1,5 +1,5 @@
 // Watertight ray-triangle intersection (Woop, Benthin, Wald 2013): one ray and one triangle, sixteen
-// rays, or sixteen triangles.
+// rays, or eight or sixteen triangles.
 //
 // A ray's frame is an affine map that takes the ray to the z axis: rows 0 and 1 shear the two minor
 // axes, row 2 scales the major one, so that z is the ray parameter t. A vertex maps to the same
@@ -29,6 +29,10 @@ DEFINE_RAY_FRAME(RayFrame, float)
 DEFINE_RAY_FRAME(RayFrame16, float16)
 
 typedef struct {
+    float8 x, y, z;
+} Corner8;
+
+typedef struct {
     float16 x, y, z;
 } Corner16;
 
@@ -37,6 +41,11 @@ typedef struct {
     float t, u, v;
     int hit;
 } TriangleHit;
+
+typedef struct {
+    float8 t, u, v;
+    int8 hit;
+} TriangleHit8;
 
 typedef struct {
     float16 t, u, v;
@@ -92,6 +101,7 @@ typedef struct {
     }
 
 DEFINE_TRIANGLE_TEST(, float, int, FMA, RayFrame, float4, TriangleHit)
+DEFINE_TRIANGLE_TEST(8, float8, int8, FMA8, RayFrame, Corner8, TriangleHit8)          // 8 triangles
 DEFINE_TRIANGLE_TEST(16, float16, int16, FMA16, RayFrame16, float4, TriangleHit16)    // 16 rays
 DEFINE_TRIANGLE_TEST(_run, float16, int16, FMA16, RayFrame, Corner16, TriangleHit16) // 16 triangles
 

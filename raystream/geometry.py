@@ -6,6 +6,7 @@ from raystream.statistics import GEOMETRY
 
 _BLOCK = 16  # triangles per block of bounds, see cl/geometry.cl
 _BOUND_ROWS = 12
+_GATHERED = 1024  # triangles to a work-item
 
 
 class Geometry:
@@ -23,7 +24,8 @@ class Geometry:
         v0, v1, v2 as float4, the fourth component unused.
     bounds : Array of shape (num_blocks * 16, 12) float32
         Centre and radius of each triangle's bounding sphere; around that centre unit normal and
-        half thickness of a slab, and half extents of a box, and 0.
+        half thickness of a slab, and half extents of a box, and 0. Bounds are made when they are
+        first asked for after an update, in the same arrays.
     bound_rows : Array of shape (num_blocks, 12, 16) float32
         The same as rows of 16 triangles.
     geom_ids : Array of shape (num_triangles,) uint32
@@ -41,10 +43,18 @@ class Geometry:
         self.geom_ids = session.upload(GEOMETRY, scene.geom_ids.astype(np.uint32))
         self.first_prims = session.upload(GEOMETRY, scene.first_prims.astype(np.uint32))
         self.triangles = session.empty((self._num_blocks * _BLOCK, 12), np.float32)
-        self.bounds = session.empty((self._num_blocks * _BLOCK, _BOUND_ROWS), np.float32)
-        self.bound_rows = session.empty((self._num_blocks, _BOUND_ROWS, _BLOCK), np.float32)
+        self._bounds, self._bounds_version = None, None
         self._vertices = session.empty(scene.vertices.shape, np.float32)
+        self._kernels = session.kernels("geometry.cl", GATHERED=_GATHERED)
         self.update(scene.vertices)
+
+    @property
+    def bounds(self):
+        return self._current_bounds()[0]
+
+    @property
+    def bound_rows(self):
+        return self._current_bounds()[1]
 
     def update(self, vertices):
         """Take new vertices, (N, 3) float32 in the scene's order; topology unchanged."""
@@ -53,14 +63,31 @@ class Geometry:
         self.version += 1
 
     def _gather(self, vertices):
+        padded = self._num_blocks * _BLOCK
         self.session.launch(
             GEOMETRY,
-            self.session.kernels("geometry.cl")["gather_triangles"],
-            self._num_blocks,
+            self._kernels["gather_triangles"],
+            -(-padded // _GATHERED),
             np.uint32(self.num_triangles),
+            np.uint32(padded),
             vertices,
             self.faces,
             self.triangles,
-            self.bounds,
-            self.bound_rows,
         )
+
+    def _current_bounds(self):
+        if self._bounds is None:
+            padded, rows = (self._num_blocks * _BLOCK, _BOUND_ROWS), (_BOUND_ROWS, _BLOCK)
+            shapes = padded, (self._num_blocks, *rows)
+            self._bounds = tuple(self.session.empty(shape, np.float32) for shape in shapes)
+        if self._bounds_version != self.version:
+            self.session.launch(
+                GEOMETRY,
+                self._kernels["bound_triangles"],
+                self._num_blocks,
+                np.uint32(self.num_triangles),
+                self.triangles,
+                *self._bounds,
+            )
+            self._bounds_version = self.version
+        return self._bounds

@@ -9,6 +9,7 @@ from raystream.pairs import CHUNKS
 from raystream.statistics import FINAL_INTERSECTION
 
 _LOCAL = 64
+_INVALID = np.uint32(0xFFFFFFFF)
 _MISS = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -36,6 +37,14 @@ class HitStream:
         """Uninitialised hits of `count` rays."""
         types = (np.float32, np.uint32, np.float32, np.float32)
         return cls(*(session.empty(count, t) for t in types))
+
+    @classmethod
+    def misses(cls, session, count):
+        """Misses of `count` rays."""
+        hits = cls.empty(session, count)
+        for field, miss in ((hits.t, np.inf), (hits.triangle, _INVALID), (hits.u, 0), (hits.v, 0)):
+            session.fill(FINAL_INTERSECTION, field, miss)
+        return hits
 
 
 def no_hits(session, count):

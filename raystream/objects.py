@@ -88,7 +88,6 @@ class _Meshes(Objects):
         order = np.full(geometry.bounds.shape[0], _INVALID)
         order[: geometry.num_triangles] = np.arange(geometry.num_triangles)
         self.order = session.upload(GEOMETRY, order)
-        self.bound_rows = geometry.bound_rows
         corners, first_groups = _distinct_corners(geometry.faces.get(), firsts)
         first_runs, run_groups = _runs(first_groups)
         self._num_runs = len(run_groups) - 1
@@ -102,6 +101,10 @@ class _Meshes(Objects):
         self._farthest = session.empty((self._num_runs, 4), np.float32)
         self._balls = session.empty((_blocks(self.num_objects), _BALL_ROWS, _BLOCK), np.float32)
         self.update()
+
+    @property
+    def bound_rows(self):
+        return self.geometry.bound_rows
 
     def update(self):
         rows, balls, farthest = self._rows, self._balls, self._farthest

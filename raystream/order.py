@@ -5,7 +5,8 @@ import functools
 import numpy as np
 
 from raystream import compress, hash
-from raystream.statistics import RAY_CREATION
+from raystream.sort import sort_by_key
+from raystream.statistics import RAY_CREATION, SORTING
 
 _INVALID = np.uint32(0xFFFFFFFF)
 _TILE = 8
@@ -93,3 +94,17 @@ def hashed_slots(session, rays, slots, name):
     """
     keys, active = hash.hash_rays(session, rays, slots, name)
     return compress.coherent_slots(session, keys, slots, active, hash.BITS[name])[0]
+
+
+def sorted_slots(session, rays, slots, name):
+    """All rays of `slots` sorted by their hashes; as `hashed_slots`, but inactive ones stay.
+
+    Where neighbours seldom have equal hashes, compressing runs of them costs more than it saves.
+
+    Returns
+    -------
+    Array of shape (n,) uint32
+    """
+    keys, _ = hash.hash_rays(session, rays, slots, name)
+    with session.clock.under(SORTING):
+        return sort_by_key(session, keys, slots, hash.BITS[name])[1]

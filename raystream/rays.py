@@ -57,16 +57,21 @@ def from_numpy(session, origins, directions, tnear, tfar):
     directions = as_float_array("directions", directions, (len(origins), 3))
     tnear = _per_ray("tnear", tnear, len(origins))
     tfar = _per_ray("tfar", tfar, len(origins))
+    upload = [session.upload(RAY_CREATION, array) for array in (origins, directions)]
+    bounds = [_on_device(session, value) for value in (tnear, tfar)]
+    packed, first_invalid = _pack(session, *upload, *bounds)
+    if first_invalid < len(origins):
+        _refuse(origins, directions, tnear, tfar)
+    return packed
+
+
+def _refuse(origins, directions, tnear, tfar):
+    """Name what is wrong with the first ray that cannot be taken."""
     check_rows("origins", "finite values", np.isfinite(origins).all(axis=1))
     check_rows("directions", "finite values", np.isfinite(directions).all(axis=1))
     check_rows("directions", "a direction that is not zero", directions.any(axis=1))
     check_rows("tnear", "a value of at least 0", np.atleast_1d(tnear >= 0))
     check_rows("tfar", "a value that is not NaN", np.atleast_1d(~np.isnan(tfar)))
-    packed = np.empty((2, len(origins), 4), np.float32)
-    packed[0, :, :3], packed[0, :, 3] = origins, tnear
-    packed[1, :, :3], packed[1, :, 3] = directions, tfar
-    upload = [session.upload(RAY_CREATION, half) for half in packed]
-    return Rays(*upload)
 
 
 def _per_ray(name, value, count):
@@ -81,10 +86,21 @@ def from_device(session, origins, directions, tnear, tfar):
     for name, array in (("origins", origins), ("directions", directions)):
         _check_device_array(name, array, (count, 3))
     bounds = [_per_ray_on_device(session, *x, count) for x in (("tnear", tnear), ("tfar", tfar))]
-    org_tnear = session.empty((count, 4), np.float32)
-    dir_tfar = session.empty((count, 4), np.float32)
+    packed, first_invalid = _pack(session, origins, directions, *bounds)
+    if first_invalid < count:
+        raise ValueError(
+            "rays: need finite origins and directions, directions that are not zero, tnear >= 0 "
+            f"and tfar not NaN, not so at index {first_invalid}"
+        )
+    return packed
+
+
+def _pack(session, origins, directions, tnear, tfar):
+    """Rays, and the index of the first that no tracer can take; their number where all are good."""
+    count = origins.shape[0]
+    packed = Rays(*(session.empty((count, 4), np.float32) for _ in range(2)))
     if count == 0:
-        return Rays(org_tnear, dir_tfar)
+        return packed, 0
     first_invalid = session.empty(1, np.uint32)
     session.fill(RAY_CREATION, first_invalid, count)
     session.launch(
@@ -94,20 +110,14 @@ def from_device(session, origins, directions, tnear, tfar):
         np.uint32(count),
         origins,
         directions,
-        *bounds[0],
-        *bounds[1],
-        org_tnear,
-        dir_tfar,
+        *tnear,
+        *tfar,
+        packed.org_tnear,
+        packed.dir_tfar,
         first_invalid,
         local=_LOCAL,
     )
-    index = int(first_invalid.get()[0])
-    if index < count:
-        raise ValueError(
-            "rays: need finite origins and directions, directions that are not zero, tnear >= 0 "
-            f"and tfar not NaN, not so at index {index}"
-        )
-    return Rays(org_tnear, dir_tfar)
+    return packed, int(first_invalid.get()[0])
 
 
 def from_camera(session, camera, size, offset=(0.5, 0.5)):
@@ -154,5 +164,9 @@ def _per_ray_on_device(session, name, value, count):
     if isinstance(value, cla.Array):
         _check_device_array(name, value, (count,))
         return value, np.uint32(1)
-    value = np.atleast_1d(_per_ray(name, value, count))
+    return _on_device(session, _per_ray(name, value, count))
+
+
+def _on_device(session, value):
+    value = np.atleast_1d(value)
     return session.upload(RAY_CREATION, value), np.uint32(len(value) > 1)

@@ -13,6 +13,7 @@ from raystream import intersect, rays
 from raystream.brute import Brute
 from raystream.checks import as_float_array, check_choice, check_count, check_rows
 from raystream.crsh import CoherentTracer
+from raystream.dual import DualTracer
 from raystream.geometry import Geometry
 from raystream.ldc import LayeredDepthCubeTracer
 from raystream.packet import PacketTracer
@@ -26,6 +27,7 @@ _METHODS = {
     "crsh": CoherentTracer,
     "ldc": LayeredDepthCubeTracer,
     "packet": PacketTracer,
+    "dual": DualTracer,
 }
 _COMMON = ("self", "session", "geometry", "memory_limit")
 # The default memory_limit: a part of the device's memory, and no more than needed to be fast.
@@ -76,7 +78,8 @@ class Tracer:
         memory where that is less.
     **options
         Of the method: see `raystream.rsh.RayspaceTracer`, `raystream.crsh.CoherentTracer`,
-        `raystream.ldc.LayeredDepthCubeTracer`, `raystream.packet.PacketTracer`.
+        `raystream.ldc.LayeredDepthCubeTracer`, `raystream.packet.PacketTracer`,
+        `raystream.dual.DualTracer`.
 
     Attributes
     ----------

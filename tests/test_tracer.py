@@ -22,7 +22,7 @@ def method(request):
 
 
 def test_methods_are_listed():
-    assert METHODS == ["brute", "rsh", "crsh", "ldc", "packet"]
+    assert METHODS == ["brute", "rsh", "crsh", "ldc", "packet", "dual"]
 
 
 @pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 64, 65, 1009])
@@ -143,7 +143,7 @@ def test_strings_are_refused():
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"method": "bvh"}, "method: need one of 'brute', 'rsh', 'crsh', 'ldc', 'packet', got 'bvh'"),
+    ({"method": "bvh"}, "'brute', 'rsh', 'crsh', 'ldc', 'packet', 'dual', got 'bvh'"),
     ({"method": "rsh", "speed": 3}, "no option 'speed'; its options: arity, levels, reduction"),
     ({"method": "brute", "arity": 4}, "no option 'arity'; its options: none"),
     ({"arity": 5}, "arity: need one of 4, 8, got 5"),

@@ -1,0 +1,430 @@
+// Bundles of 64 coherent rays against the scene hierarchy (tree.h): the Partition traversal of
+// Overbeck, Ramamoorthi and Mark 2008 (section 3), with masks of rays in the place of its list.
+//
+// A bundle is four groups of sixteen rays. Intervals of the rays' origins and inverse directions
+// enclose all of them: one interval test tells which of a node's eight children any ray may enter,
+// and where the first one enters. Children wait on a stack, nearest on top, with the rays that
+// entered their parent. When a child is popped each of these rays is tested against its box alone, up
+// to the ray's hit so far. Where few rays of a group are left they finish that child as single rays.
+// In a leaf, triangles whose box the intervals miss are dropped, the others are tested with sixteen
+// rays at once.
+//
+// Work-item g takes bundle g * stride; with a stride some bundles are traced to know the others by.
+
+#include "single.h"
+
+#define GROUPS 4 // of sixteen rays
+#define RAYS (16 * GROUPS)
+#define FEW 6 // rays that are better off alone
+#define CLOSE_END(g, t) ((t) * (g)->per_t * OUTWARDS)
+
+typedef struct {
+    float16 inverse[3], near[3], far[3]; // as in BoxRay
+    int16 falls[3];                      // whether the direction falls along the axis
+    float16 begin, end, per_t;
+    RayFrame16 frame;
+    uint16 nearest; // triangle of the hit at frame.tfar, INVALID where there is none
+    float16 u, v;
+} Group;
+
+// Bounds of all rays of a bundle: where they enter and leave planes lies between plane * inverse +
+// near (far) of the two ends of `inverse`. An axis along which not all go the same way says nothing.
+typedef struct {
+    float inverse[3][2], near[3][2], far[3][2];
+    bool falls[3], says[3];
+    float begin, end;
+} Interval;
+
+typedef struct {
+    Group groups[GROUPS];
+    Interval interval;
+    ulong open; // rays that look for a hit: all, or those that have none
+    bool any;   // one hit is enough
+} Bundle;
+
+inline float highest(float16 v) { return -lowest(-v); }
+
+// cl/triangle.h: ray_frame, lane by lane.
+inline RayFrame16 frame_of(const Rays16 *r)
+{
+    const float16 ax = magnitude(r->dx), ay = magnitude(r->dy), az = magnitude(r->dz);
+    const int16 x = (ax >= ay) & (ax >= az), y = ~x & (ay >= az), z = ~(x | y);
+    const float16 major = x ? r->dx : y ? r->dy : r->dz;
+    const float16 qx = -(r->dx / major), qy = -(r->dy / major), qz = -(r->dz / major);
+    const float16 inverse = 1.0f / major, zero = 0.0f, one = 1.0f;
+    const RayFrame16 f = {r->ox,
+                          r->oy,
+                          r->oz,
+                          x ? qy : z ? one : zero,
+                          x ? one : y ? qz : zero,
+                          y ? one : z ? qx : zero,
+                          x ? qz : y ? one : zero,
+                          y ? qx : z ? one : zero,
+                          x ? one : z ? qy : zero,
+                          x ? inverse : zero,
+                          y ? inverse : zero,
+                          z ? inverse : zero,
+                          r->tnear,
+                          r->tfar < MAXFLOAT ? r->tfar : (float16)MAXFLOAT};
+    return f;
+}
+
+// Sixteen rays, and bounds of the active ones.
+typedef struct {
+    float low_org[3], high_org[3], low_inverse[3], high_inverse[3];
+    float slack, begin, end;
+} Bounds;
+
+inline void widen(float *low, float *high, float16 v, int16 active)
+{
+    const float l = lowest(active ? v : (float16)INFINITY);
+    const float h = highest(active ? v : (float16)-INFINITY);
+    *low = MIN(*low, l);
+    *high = MAX(*high, h);
+}
+
+// cl/dual.h: box_ray, lane by lane.
+inline void set_group(Group *g, const Rays16 *r, const Box *scene, Bounds *bounds)
+{
+    const int16 active = r->tfar >= r->tnear;
+    const float16 o[3] = {r->ox, r->oy, r->oz}, d[3] = {r->dx, r->dy, r->dz};
+    float16 per_t = 0.0f, offset = 0.0f, reach = 0.0f;
+    for (uint k = 0; k < 3; k++) {
+        per_t = larger(per_t, magnitude(d[k]));
+        offset = larger(offset, magnitude(o[k]));
+        reach = larger(reach, larger(magnitude(scene->low[k] - o[k]),
+                                     magnitude(scene->high[k] - o[k])));
+    }
+    const float16 slack = 0x1p-18f * reach + 0x1p-22f * offset;
+    for (uint k = 0; k < 3; k++) {
+        const float16 slope = d[k] / per_t;
+        const float16 steep = larger(magnitude(slope), STILL), inverse = 1.0f / steep;
+        g->falls[k] = slope < 0.0f;
+        g->inverse[k] = g->falls[k] ? -inverse : inverse;
+        g->near[k] = -o[k] * g->inverse[k] - slack * inverse;
+        g->far[k] = -o[k] * g->inverse[k] + slack * inverse;
+        widen(&bounds->low_org[k], &bounds->high_org[k], o[k], active);
+        widen(&bounds->low_inverse[k], &bounds->high_inverse[k], g->inverse[k], active);
+    }
+    g->frame = frame_of(r);
+    g->per_t = per_t;
+    g->begin = r->tnear * per_t / OUTWARDS + 0.0f;
+    g->end = CLOSE_END(g, g->frame.tfar);
+    g->nearest = INVALID;
+    float unused = 0.0f;
+    widen(&unused, &bounds->slack, slack, active);
+    widen(&bounds->begin, &unused, g->begin, active);
+    widen(&unused, &bounds->end, g->end, active);
+}
+
+inline Interval interval_of(const Bounds *b)
+{
+    Interval v;
+    for (uint k = 0; k < 3; k++) {
+        const bool falls = v.falls[k] = b->high_inverse[k] < 0.0f;
+        const float low = b->low_org[k] - b->slack, high = b->high_org[k] + b->slack;
+        v.says[k] = falls || b->low_inverse[k] > 0.0f;
+        v.inverse[k][0] = b->low_inverse[k];
+        v.inverse[k][1] = b->high_inverse[k];
+        for (uint end = 0; end < 2; end++) {
+            v.near[k][end] = -(falls ? low : high) * v.inverse[k][end];
+            v.far[k][end] = -(falls ? high : low) * v.inverse[k][end];
+        }
+    }
+    v.begin = b->begin;
+    v.end = b->end;
+    return v;
+}
+
+// Eight boxes.
+typedef struct {
+    float8 low[3], high[3];
+} Boxes;
+
+// Bit k: some ray may enter box k; at (*enter)[k] at the earliest.
+inline uint enter_boxes(const Interval *v, const Boxes *boxes, float8 *enter)
+{
+    float8 a = v->begin, b = v->end;
+    for (uint k = 0; k < 3; k++) {
+        if (!v->says[k])
+            continue;
+        const float8 first = v->falls[k] ? boxes->high[k] : boxes->low[k];
+        const float8 last = v->falls[k] ? boxes->low[k] : boxes->high[k];
+        const float8 i0 = v->inverse[k][0], i1 = v->inverse[k][1];
+        const float8 near0 = FMA8(first, i0, (float8)(v->near[k][0]));
+        const float8 near1 = FMA8(first, i1, (float8)(v->near[k][1]));
+        const float8 far0 = FMA8(last, i0, (float8)(v->far[k][0]));
+        const float8 far1 = FMA8(last, i1, (float8)(v->far[k][1]));
+        const float8 near = near0 < near1 ? near0 : near1, far = far0 > far1 ? far0 : far1;
+        a = near > a ? near : a;
+        b = far < b ? far : b;
+    }
+    *enter = a;
+    return MASK8(a <= b);
+}
+
+// Rays of a group that enter a box: six rows of eight boxes, the box in the first lane.
+inline uint rays_entering(const Group *g, const Interval *v, global const float *box)
+{
+    float16 a = g->begin, b = g->end;
+    for (uint k = 0; k < 3; k++) {
+        const float low = box[8 * k], high = box[8 * (3 + k)];
+        float16 first = v->falls[k] ? high : low, last = v->falls[k] ? low : high;
+        if (!v->says[k]) {
+            first = g->falls[k] ? (float16)high : (float16)low;
+            last = g->falls[k] ? (float16)low : (float16)high;
+        }
+        const float16 near = FMA16(first, g->inverse[k], g->near[k]);
+        const float16 far = FMA16(last, g->inverse[k], g->far[k]);
+        a = near > a ? near : a;
+        b = far < b ? far : b;
+    }
+    return MASK16(a <= b);
+}
+
+#define LANE(T, field) (((T *)&g->field)[lane])
+
+inline SingleRay ray_of_lane(const Group *g, uint lane)
+{
+    SingleRay r;
+    for (uint k = 0; k < 3; k++) {
+        r.box.inverse[k] = LANE(float, inverse[k]);
+        r.box.near[k] = LANE(float, near[k]);
+        r.box.far[k] = LANE(float, far[k]);
+        r.box.low_row[k] = r.box.inverse[k] < 0.0f ? 3 + k : k;
+    }
+    r.box.begin = LANE(float, begin);
+    r.box.end = LANE(float, end);
+    r.box.per_t = LANE(float, per_t);
+    const RayFrame f = {LANE(float, frame.ox),    LANE(float, frame.oy),  LANE(float, frame.oz),
+                        LANE(float, frame.x0),    LANE(float, frame.y0),  LANE(float, frame.z0),
+                        LANE(float, frame.x1),    LANE(float, frame.y1),  LANE(float, frame.z1),
+                        LANE(float, frame.x2),    LANE(float, frame.y2),  LANE(float, frame.z2),
+                        LANE(float, frame.tnear), LANE(float, frame.tfar)};
+    r.frame = f;
+    const uint triangle = LANE(uint, nearest);
+    r.nearest = triangle == INVALID ? MISS : hit_key(f.tfar, triangle);
+    r.u = LANE(float, u);
+    r.v = LANE(float, v);
+    return r;
+}
+
+inline void store_lane(Group *g, uint lane, const SingleRay *r)
+{
+    LANE(float, frame.tfar) = r->frame.tfar;
+    LANE(float, end) = r->box.end;
+    LANE(uint, nearest) = r->nearest == MISS ? INVALID : (uint)r->nearest;
+    LANE(float, u) = r->u;
+    LANE(float, v) = r->v;
+}
+
+// Rays of `mask` of one group finish `node` alone; returns those that have a hit.
+inline uint finish_alone(Group *g, uint mask, const Tree *tree, uint node, bool any, Counts *c)
+{
+    uint hit = 0;
+    for (; mask != 0; mask &= mask - 1) {
+        const uint lane = LOWEST(mask);
+        SingleRay r = ray_of_lane(g, lane);
+        walk(&r, tree, node, any, c);
+        store_lane(g, lane, &r);
+        hit |= (uint)(r.nearest != MISS) << lane;
+    }
+    return hit;
+}
+
+// Sixteen rays, those in `mask`, and triangle k of a leaf; returns those that have a new hit.
+inline uint test_triangle(Group *g, uint mask, global const float *leaf, uint k, Counts *c)
+{
+    const float4 v0 = (float4)(leaf[k], leaf[8 + k], leaf[16 + k], 0.0f);
+    const float4 v1 = (float4)(leaf[24 + k], leaf[32 + k], leaf[40 + k], 0.0f);
+    const float4 v2 = (float4)(leaf[48 + k], leaf[56 + k], leaf[64 + k], 0.0f);
+    float16 edges[3], depths[3];
+    const int16 inside = inside_edges16(&g->frame, v0, v1, v2, edges, depths);
+    c->tests += COUNT16(mask);
+    if ((MASK16(inside) & mask) == 0)
+        return 0;
+    const TriangleHit16 h = finish_hit16(&g->frame, inside, edges, depths);
+    const uint triangle = ((global const uint *)leaf)[8 * LEAF_TRIANGLE_ROW + k];
+    // Equal distances go to the smaller triangle.
+    const int16 nearer = h.hit & ((h.t < g->frame.tfar) | (triangle < g->nearest));
+    g->frame.tfar = nearer ? h.t : g->frame.tfar;
+    g->nearest = nearer ? (uint16)triangle : g->nearest;
+    g->end = nearer ? CLOSE_END(g, h.t) : g->end;
+    g->u = nearer ? h.u : g->u;
+    g->v = nearer ? h.v : g->v;
+    const uint hit = MASK16(h.hit);
+    c->hits += COUNT16(hit & mask);
+    return hit;
+}
+
+inline uint rays_of(ulong mask, uint group) { return (uint)(mask >> 16 * group) & 0xffff; }
+
+inline void close(Bundle *b, uint hit, uint group)
+{
+    if (b->any)
+        b->open &= ~((ulong)hit << 16 * group);
+}
+
+// The least end of the bundle that encloses those of its rays.
+inline void shorten(Bundle *b)
+{
+    float16 end = b->groups[0].end;
+    for (uint g = 1; g < GROUPS; g++)
+        end = larger(end, b->groups[g].end);
+    b->interval.end = highest(end);
+}
+
+inline void test_leaf_bundle(Bundle *b, ulong mask, const Tree *tree, uint node, Counts *c)
+{
+    global const float8 *leaf = tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS;
+    Boxes boxes;
+    for (uint k = 0; k < 3; k++) {
+        const float8 v0 = leaf[k], v1 = leaf[3 + k], v2 = leaf[6 + k];
+        const float8 low = v0 < v1 ? v0 : v1, high = v0 > v1 ? v0 : v1;
+        boxes.low[k] = low < v2 ? low : v2;
+        boxes.high[k] = high > v2 ? high : v2;
+    }
+    float8 unused;
+    const uint triangles = enter_boxes(&b->interval, &boxes, &unused) & MASK8(leaf[0] == leaf[0]);
+    const uint count = COUNT16(triangles);
+    c->leaves++;
+    c->leaf_tests += TREE_WIDTH;
+    c->leaf_boxes += count;
+    if (triangles == 0)
+        return;
+    for (uint g = 0; g < GROUPS; g++) {
+        const uint rays = rays_of(mask, g);
+        if (rays == 0)
+            continue;
+        uint hit = 0;
+        if (COUNT16(rays) < count)
+            hit = finish_alone(b->groups + g, rays, tree, node, b->any, c);
+        else
+            for (uint left = triangles; left != 0; left &= left - 1)
+                hit |= test_triangle(b->groups + g, rays, (global const float *)leaf, LOWEST(left),
+                                     c);
+        close(b, hit, g);
+    }
+    shorten(b);
+}
+
+// Rays of `mask` that enter a child's box and stay in the bundle. Where few enter they have finished the
+// child alone.
+inline ulong enter_child(Bundle *b, ulong mask, const Tree *tree, global const float *box, uint child,
+                         Counts *c)
+{
+    ulong entered = 0;
+    for (uint g = 0; g < GROUPS; g++) {
+        const uint before = rays_of(mask, g);
+        if (before == 0)
+            continue;
+        const uint rays = rays_entering(b->groups + g, &b->interval, box) & before;
+        entered |= (ulong)rays << 16 * g;
+    }
+    const uint count = COUNT64(entered);
+    c->box_tests += COUNT64(mask);
+    c->boxes += count;
+    if (count > FEW || count == 0 || (child & LEAF))
+        return entered;
+    for (uint g = 0; g < GROUPS; g++) {
+        const uint rays = rays_of(entered, g);
+        close(b, finish_alone(b->groups + g, rays, tree, child, b->any, c), g);
+    }
+    shorten(b);
+    return 0;
+}
+
+inline void walk_bundle(Bundle *b, const Tree *tree, Counts *c)
+{
+    ulong stack[TREE_STACK], waiting[TREE_STACK];
+    uint top = 0, node = 0;
+    ulong rays = b->open;
+    for (;;) {
+        global const float8 *rows = tree->nodes + (ulong)node * TREE_ROWS;
+        const Boxes boxes = {{rows[0], rows[1], rows[2]}, {rows[3], rows[4], rows[5]}};
+        float distance[8] __attribute__((aligned(32)));
+        const uint mask = enter_boxes(&b->interval, &boxes, (float8 *)distance);
+        c->nodes++;
+        c->box_tests += TREE_WIDTH;
+        c->boxes += COUNT16(mask);
+        const uint base = top;
+        for (uint left = mask; left != 0; left &= left - 1) {
+            const uint k = LOWEST(left);
+            const ulong box = entry(distance[k], TREE_WIDTH * node + k);
+            prefetch_child(tree, ((global const uint *)(rows + TREE_CHILD_ROW))[k]);
+            uint place = top;
+            for (; place > base && stack[place - 1] < box; place--)
+                stack[place] = stack[place - 1];
+            stack[place] = box;
+            waiting[top++] = rays;
+        }
+        rays = 0;
+        while (rays == 0) {
+            if (top == 0)
+                return;
+            const ulong box = stack[--top];
+            const ulong looking = waiting[top] & b->open;
+            if (looking == 0 || as_float((uint)(box >> 32)) > b->interval.end)
+                continue;
+            const uint k = (uint)box % TREE_WIDTH;
+            rows = tree->nodes + (ulong)((uint)box / TREE_WIDTH) * TREE_ROWS;
+            node = ((global const uint *)(rows + TREE_CHILD_ROW))[k];
+            rays = enter_child(b, looking, tree, (global const float *)rows + k, node, c);
+            if (rays != 0 && (node & LEAF)) {
+                test_leaf_bundle(b, rays, tree, node, c);
+                rays = 0;
+            }
+        }
+    }
+}
+
+inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, bool any,
+                         global const uint *slots, global const float4 *org_tnear,
+                         global const float4 *dir_tfar)
+{
+    Bounds bounds = {{INFINITY, INFINITY, INFINITY},
+                     {-INFINITY, -INFINITY, -INFINITY},
+                     {INFINITY, INFINITY, INFINITY},
+                     {-INFINITY, -INFINITY, -INFINITY},
+                     0.0f,
+                     INFINITY,
+                     -INFINITY};
+    b->open = 0;
+    b->any = any;
+    for (uint g = 0; g < GROUPS; g++) {
+        const Rays16 r = gather_rays(first + 16 * g, 1, stop, slots, org_tnear, dir_tfar);
+        set_group(b->groups + g, &r, scene, &bounds);
+        b->open |= (ulong)MASK16(r.tfar >= r.tnear) << 16 * g;
+    }
+    b->interval = interval_of(&bounds);
+}
+
+#define DEFINE_BUNDLE(NAME, ANY, RESULT, STORE)                                                    \
+    kernel void NAME(const uint num_slots, const uint stride, global const uint *restrict slots,   \
+                     global const float4 *restrict org_tnear,                                      \
+                     global const float4 *restrict dir_tfar, global const float8 *restrict nodes,  \
+                     global const float8 *restrict leaves, global ulong *restrict counts, RESULT)  \
+    {                                                                                              \
+        const uint first = get_global_id(0) * stride * RAYS;                                       \
+        const Tree tree = {nodes, leaves};                                                         \
+        const Box scene = scene_box(nodes);                                                        \
+        Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
+        Bundle b;                                                                                  \
+        start_bundle(&b, first, num_slots, &scene, ANY, slots, org_tnear, dir_tfar);               \
+        c.rays = COUNT64(b.open);                                                                  \
+        if (b.open != 0)                                                                           \
+            walk_bundle(&b, &tree, &c);                                                            \
+        for (uint i = 0; i < RAYS; i++) {                                                          \
+            const Group *g = b.groups + i / 16;                                                    \
+            const uint lane = i % 16, triangle = LANE(uint, nearest);                              \
+            if (triangle != INVALID) {                                                             \
+                const uint ray = slots[first + i];                                                 \
+                STORE;                                                                             \
+            }                                                                                      \
+        }                                                                                          \
+        store_counts(&c, counts);                                                                  \
+    }
+
+DEFINE_BUNDLE(intersect_bundle, false, HITS_ARGUMENTS,
+              STORE_HIT(ray, LANE(float, frame.tfar), triangle, LANE(float, u), LANE(float, v)))
+DEFINE_BUNDLE(occlude_bundle, true, global uchar *restrict blocked, blocked[ray] = 1)

@@ -1,0 +1,167 @@
+// Streams of incoherent rays against the scene hierarchy (tree.h): many rays walk the tree together,
+// depth first, each list of rays meeting a node while it is in the cache and without the jumps that
+// single rays mispredict.
+//
+// A stack entry is a child with the list of the rays that entered it. At a node every ray of its list is
+// tested against the eight boxes; the ids of those that enter a child are compressed into that child's
+// list. Children are pushed by the mean distance at which their rays enter, nearest on top. Where few
+// rays are left, or no room for lists, they finish the child as single rays.
+//
+// Build-time constant: RAYS, to a work-item.
+
+#include "single.h"
+
+#define FEW 4 // rays that are better off alone
+#define ROOM (12 * RAYS) // for the ids of all lists on the stack
+
+typedef struct {
+    uint node, begin, count;
+} List;
+
+typedef struct {
+    SingleRay rays[RAYS];
+    uint ids[ROOM + 16];
+    uchar entered[RAYS + 16];
+    bool any;
+} Stream;
+
+// The ids of `list` whose ray entered child k, to `out`; returns how many they are.
+inline uint compress_list(const Stream *s, List list, uint k, uint *out)
+{
+    const uint *ids = s->ids + list.begin;
+    uint count = 0;
+#ifdef COMPRESS16
+    for (uint i = 0; i < list.count; i += 16) {
+        const uchar16 bits = LOAD_PRIVATE(uchar16, s->entered + i) & (uchar16)(1 << k);
+        const uint lanes = list.count - i < 16 ? (1u << (list.count - i)) - 1 : 0xffff;
+        const uint mask = MASK16(CONVERT(int16, bits) != 0) & lanes;
+        STORE_PRIVATE(uint16, out + count, COMPRESS16(LOAD_PRIVATE(uint16, ids + i), mask));
+        count += COUNT16(mask);
+    }
+#else
+    for (uint i = 0; i < list.count; i++) {
+        out[count] = ids[i];
+        count += s->entered[i] >> k & 1;
+    }
+#endif
+    return count;
+}
+
+inline void finish_list(Stream *s, const Tree *tree, List list, Counts *c)
+{
+    for (uint i = 0; i < list.count; i++) {
+        SingleRay *r = s->rays + s->ids[list.begin + i];
+        if (!(s->any && r->nearest != MISS))
+            walk(r, tree, list.node, s->any, c);
+    }
+}
+
+// Push the children of a node that rays of `list` enter; returns the new height of the stack.
+inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, uint top, Counts *c)
+{
+    global const float8 *rows = tree->nodes + (ulong)list.node * TREE_ROWS;
+    global const uint *children = (global const uint *)(rows + TREE_CHILD_ROW);
+    float8 sum = 0.0f;
+    int8 count = 0;
+    for (uint i = 0; i < list.count; i++) {
+        const SingleRay *r = s->rays + s->ids[list.begin + i];
+        float8 enter;
+        int8 enters = enter_children(&r->box, rows, &enter);
+        if (s->any && r->nearest != MISS)
+            enters = 0;
+        s->entered[i] = (uchar)MASK8(enters);
+        sum += enters ? enter : 0.0f;
+        count -= enters;
+    }
+    float distance[8] __attribute__((aligned(32)));
+    uint counts[8] __attribute__((aligned(32)));
+    *(float8 *)distance = sum / CONVERT(float8, count);
+    *(uint8 *)counts = as_uint8(count);
+    ulong order[8];
+    uint num = 0;
+    for (uint k = 0; k < 8; k++) {
+        if (counts[k] == 0)
+            continue;
+        c->boxes += counts[k];
+        const ulong child = entry(distance[k], k);
+        uint place = num++;
+        for (; place > 0 && order[place - 1] < child; place--)
+            order[place] = order[place - 1];
+        order[place] = child;
+    }
+    uint begin = list.begin + list.count;
+    for (uint i = 0; i < num; i++) {
+        const uint k = (uint)order[i];
+        const List child = {children[k], begin, counts[k]};
+        prefetch_child(tree, child.node);
+        compress_list(s, list, k, s->ids + begin);
+        stack[top++] = child;
+        begin += counts[k];
+    }
+    c->nodes++;
+    c->box_tests += TREE_WIDTH * list.count;
+    return top;
+}
+
+inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
+{
+    List stack[TREE_STACK];
+    const List all = {0, 0, num_rays};
+    for (uint i = 0; i < num_rays; i++)
+        s->ids[i] = i;
+    stack[0] = all;
+    for (uint top = 1; top > 0;) {
+        const List list = stack[--top];
+        if (list.node & LEAF) {
+            global const float8 *leaf = tree->leaves + (ulong)(list.node & ~LEAF) * LEAF_ROWS;
+            for (uint i = 0; i < list.count; i++) {
+                SingleRay *r = s->rays + s->ids[list.begin + i];
+                if (!(s->any && r->nearest != MISS))
+                    test_leaf(r, leaf, c);
+            }
+        } else if (list.count <= FEW || list.begin + 9 * list.count > ROOM) {
+            finish_list(s, tree, list, c);
+        } else {
+            top = push_children(s, tree, list, stack, top, c);
+        }
+    }
+}
+
+#define DEFINE_STREAM(NAME, ANY, RESULT, STORE)                                                    \
+    kernel void NAME(const uint num_slots, const uint stride, global const uint *restrict slots,   \
+                     global const float4 *restrict org_tnear,                                      \
+                     global const float4 *restrict dir_tfar, global const float8 *restrict nodes,  \
+                     global const float8 *restrict leaves, global ulong *restrict counts, RESULT)  \
+    {                                                                                              \
+        const uint first = get_global_id(0) * stride * RAYS;                                       \
+        const uint stop = MIN(first + RAYS, num_slots);                                            \
+        const Tree tree = {nodes, leaves};                                                         \
+        const Box scene = scene_box(nodes);                                                        \
+        Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
+        Stream s;                                                                                  \
+        uint number[RAYS];                                                                         \
+        s.any = ANY;                                                                               \
+        for (uint i = first; i < stop; i++) {                                                      \
+            const uint ray = slots[i], soon = slots[MIN(i + AHEAD, num_slots - 1)];                \
+            PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));                                    \
+            PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));                                     \
+            if (ray == INVALID || !(dir_tfar[ray].w >= org_tnear[ray].w))                          \
+                continue;                                                                          \
+            s.rays[c.rays] = single_ray(&scene, org_tnear[ray], dir_tfar[ray]);                    \
+            number[c.rays++] = ray;                                                                \
+        }                                                                                          \
+        if (c.rays != 0)                                                                           \
+            walk_stream(&s, c.rays, &tree, &c);                                                    \
+        for (uint i = 0; i < c.rays; i++) {                                                        \
+            const SingleRay *r = s.rays + i;                                                       \
+            const uint ray = number[i];                                                            \
+            if (r->nearest != MISS) {                                                              \
+                STORE;                                                                             \
+            }                                                                                      \
+        }                                                                                          \
+        store_counts(&c, counts);                                                                  \
+    }
+
+DEFINE_STREAM(intersect_stream, false, HITS_ARGUMENTS,
+              STORE_HIT(ray, r->frame.tfar, (uint)r->nearest, r->u, r->v))
+DEFINE_STREAM(occlude_stream, true, global uchar *restrict blocked, blocked[ray] = 1)

@@ -1,0 +1,41 @@
+// Single rays against the scene hierarchy (tree.h): a ray meets the eight boxes of a node at once,
+// goes on to the nearest child and keeps the others on a stack, nearest on top, with the distance
+// at which it enters them; what lies behind the hit so far is dropped when it is popped. A leaf's
+// eight triangles are tested at once. Any-hit rays end at the first hit.
+//
+// The reference of bundle.cl and ray_stream.cl, which hand their stragglers to it.
+//
+// Build-time constant: RAYS, to a work-item.
+
+#include "single.h"
+
+#define DEFINE_SINGLE(NAME, ANY, RESULT, STORE)                                                    \
+    kernel void NAME(const uint num_slots, const uint stride, global const uint *restrict slots,   \
+                     global const float4 *restrict org_tnear,                                      \
+                     global const float4 *restrict dir_tfar, global const float8 *restrict nodes,  \
+                     global const float8 *restrict leaves, global ulong *restrict counts, RESULT)  \
+    {                                                                                              \
+        const uint first = get_global_id(0) * stride * RAYS;                                       \
+        const uint stop = MIN(first + RAYS, num_slots);                                            \
+        const Tree tree = {nodes, leaves};                                                         \
+        const Box scene = scene_box(nodes);                                                        \
+        Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
+        for (uint i = first; i < stop; i++) {                                                      \
+            const uint ray = slots[i], soon = slots[MIN(i + AHEAD, num_slots - 1)];                \
+            PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));                                    \
+            PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));                                     \
+            if (ray == INVALID || !(dir_tfar[ray].w >= org_tnear[ray].w))                          \
+                continue;                                                                          \
+            SingleRay r = single_ray(&scene, org_tnear[ray], dir_tfar[ray]);                       \
+            walk(&r, &tree, 0, ANY, &c);                                                           \
+            c.rays++;                                                                              \
+            if (r.nearest != MISS) {                                                               \
+                STORE;                                                                             \
+            }                                                                                      \
+        }                                                                                          \
+        store_counts(&c, counts);                                                                  \
+    }
+
+DEFINE_SINGLE(intersect_single, false, HITS_ARGUMENTS,
+              STORE_HIT(ray, r.frame.tfar, (uint)r.nearest, r.u, r.v))
+DEFINE_SINGLE(occlude_single, true, global uchar *restrict blocked, blocked[ray] = 1)

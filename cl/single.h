@@ -1,0 +1,150 @@
+// One ray's walk down a tree: see single.cl.
+
+#include "dual.h"
+#include "rays.h"
+
+typedef struct {
+    global const float8 *nodes, *leaves;
+} Tree;
+
+// A node or leaf will be visited: most are not in the cache.
+inline void prefetch_child(const Tree *tree, uint child)
+{
+    global const float8 *rows = child & LEAF ? tree->leaves + (ulong)(child & ~LEAF) * LEAF_ROWS
+                                             : tree->nodes + (ulong)child * TREE_ROWS;
+    for (uint k = 0; k < LEAF_ROWS; k += 2)
+        PREFETCH(rows + k);
+}
+
+// Of a work-item: rays traced; visits of nodes, tests of their boxes, boxes entered; visits of leaves,
+// tests of their triangles' boxes, boxes entered; ray-triangle tests, hits within the segment as far
+// as it then reached.
+typedef struct {
+    uint rays, nodes, box_tests, boxes, leaves, leaf_tests, leaf_boxes, tests, hits;
+} Counts;
+
+#define NUM_COUNTS 9
+
+inline void store_counts(const Counts *c, global ulong *counts)
+{
+    counts += NUM_COUNTS * get_global_id(0);
+    counts[0] = c->rays;
+    counts[1] = c->nodes;
+    counts[2] = c->box_tests;
+    counts[3] = c->boxes;
+    counts[4] = c->leaves;
+    counts[5] = c->leaf_tests;
+    counts[6] = c->leaf_boxes;
+    counts[7] = c->tests;
+    counts[8] = c->hits;
+}
+
+// Of the rays that hit; the arrays hold misses before.
+#define HITS_ARGUMENTS                                                                             \
+    global float *restrict hit_t, global uint *restrict hit_triangle, global float *restrict hit_u,\
+        global float *restrict hit_v
+#define STORE_HIT(ray, t, triangle, u, v)                                                          \
+    (hit_t[ray] = (t), hit_triangle[ray] = (triangle), hit_u[ray] = (u), hit_v[ray] = (v))
+
+// `nearest` is the key of the hit so far, at weights u and v of its triangle.
+typedef struct {
+    BoxRay box;
+    RayFrame frame;
+    ulong nearest;
+    float u, v;
+} __attribute__((aligned(64))) SingleRay; // the box in one cache line, frame and nearest in the next
+
+inline SingleRay single_ray(const Box *scene, float4 org_tnear, float4 dir_tfar)
+{
+    SingleRay r;
+    r.box = box_ray(scene, org_tnear, dir_tfar);
+    r.frame = ray_frame(org_tnear, dir_tfar);
+    r.nearest = MISS;
+    r.u = r.v = 0.0f;
+    return r;
+}
+
+inline void test_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
+{
+    const Corner8 v0 = {leaf[0], leaf[1], leaf[2]};
+    const Corner8 v1 = {leaf[3], leaf[4], leaf[5]};
+    const Corner8 v2 = {leaf[6], leaf[7], leaf[8]};
+    float8 edges[3], depths[3];
+    const int8 inside = inside_edges8(&r->frame, v0, v1, v2, edges, depths);
+    c->leaves++;
+    c->tests += TREE_WIDTH;
+    if (MASK8(inside) == 0)
+        return;
+    const TriangleHit8 h = finish_hit8(&r->frame, inside, edges, depths);
+    uint mask = MASK8(h.hit);
+    if (mask == 0)
+        return;
+    c->hits += COUNT16(mask);
+    float t[8] __attribute__((aligned(32))), u[8] __attribute__((aligned(32))),
+        v[8] __attribute__((aligned(32)));
+    *(float8 *)t = h.t;
+    *(float8 *)u = h.u;
+    *(float8 *)v = h.v;
+    for (; mask != 0; mask &= mask - 1) {
+        const uint k = LOWEST(mask);
+        const ulong key = hit_key(t[k], ((global const uint *)(leaf + LEAF_TRIANGLE_ROW))[k]);
+        if (key < r->nearest) {
+            r->nearest = key;
+            r->u = u[k];
+            r->v = v[k];
+        }
+    }
+    // Equal distances still hit, and are still entered.
+    r->frame.tfar = as_float((uint)(r->nearest >> 32));
+    r->box.end = r->frame.tfar * r->box.per_t * OUTWARDS;
+}
+
+// A child and where it is entered, ordered by the latter: s >= 0, so its bits sort like its value.
+inline ulong entry(float enter, uint child) { return ((ulong)as_uint(enter) << 32) | child; }
+
+// Walk the tree from `node`; where `any`, up to the first hit.
+inline void walk(SingleRay *r, const Tree *tree, uint node, bool any, Counts *c)
+{
+    ulong stack[TREE_STACK];
+    uint top = 0;
+    for (;;) {
+        if (node & LEAF) {
+            test_leaf(r, tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS, c);
+            if (any && r->nearest != MISS)
+                return;
+        } else {
+            global const float8 *rows = tree->nodes + (ulong)node * TREE_ROWS;
+            global const uint *children = (global const uint *)(rows + TREE_CHILD_ROW);
+            float8 enter;
+            uint mask = MASK8(enter_children(&r->box, rows, &enter));
+            c->nodes++;
+            c->box_tests += TREE_WIDTH;
+            c->boxes += COUNT16(mask);
+            if (mask != 0 && (mask & (mask - 1)) == 0) {
+                node = children[LOWEST(mask)];
+                continue;
+            }
+            if (mask != 0) {
+                float distance[8] __attribute__((aligned(32)));
+                *(float8 *)distance = enter;
+                const uint base = top;
+                for (; mask != 0; mask &= mask - 1) {
+                    const uint k = LOWEST(mask);
+                    const ulong child = entry(distance[k], children[k]);
+                    uint place = top++;
+                    for (; place > base && stack[place - 1] < child; place--)
+                        stack[place] = stack[place - 1];
+                    stack[place] = child;
+                }
+                node = (uint)stack[--top];
+                continue;
+            }
+        }
+        do {
+            if (top == 0)
+                return;
+            top--;
+        } while (as_float((uint)(stack[top] >> 32)) > r->box.end);
+        node = (uint)stack[top];
+    }
+}

@@ -1,0 +1,198 @@
+"""Method `dual`: rays against a scene hierarchy that is built on the device every frame.
+
+The scene hierarchy is `raystream.tree`'s. Rays walk it alone (cl/single.cl), as bundles of 64
+(cl/bundle.cl) or as streams of thousands (cl/ray_stream.cl); all three find the hits of `brute`,
+bit for bit. Which of them is faster depends on how many rays of a bundle share a visit of a node:
+see `DualTracer._plan`.
+"""
+
+import dataclasses
+
+import numpy as np
+import pyopencl.array as cla
+
+from raystream.checks import check_choice
+from raystream.hash import DEFAULT_HASH
+from raystream.intersect import HitStream, not_blocked
+from raystream.order import leaf_slots, sorted_slots
+from raystream.statistics import TRAVERSAL, Statistics
+from raystream.tree import BUILDERS, SceneTree
+
+TRAVERSALS = ("auto", "single", "bundle", "stream")
+_FILES = {"single": "single.cl", "bundle": "bundle.cl", "stream": "ray_stream.cl"}
+_RAYS = {"single": 64, "bundle": 64, "stream": 2048}  # to a work-item
+# In the order of `Counts` (cl/single.h).
+_COUNTS = (
+    "rays", "nodes", "box_tests", "boxes", "leaves", "leaf_tests", "leaf_boxes", "tests", "hits"
+)  # fmt: skip
+
+# The better builder takes 75 ns more for each triangle and saves 25 ns of a ray (medians of five
+# scenes and five kinds of rays, 34,000 to 331,000 triangles, two cores).
+_RAYS_OF_QUALITY = 3
+# See `DualTracer._plan`. Measured with five scenes, rays from a camera, a light and mirrors, two
+# cores: sorting 262,144 rays lost 1 to 8 ms where bundles had made 0.2 to 1.0 visits per ray,
+# gained nothing at 1.3, and saved 2 to 58 ms from 2.3 on (but for one case). Bundles were 1.1 times
+# as fast as streams and more where at least 4.8 rays shared a visit, streams 1.1 to 1.8 times as
+# fast as bundles where fewer did.
+_FEW_RAYS = 8192
+_SAMPLES = 32
+_VISITS_WORTH_A_SORT = 1.5
+_SHARED_BY_BUNDLE = 4.75
+
+
+@dataclasses.dataclass
+class _Plan:
+    """A traversal, and the order of the rays for it."""
+
+    traversal: str
+    slots: cla.Array
+
+
+@dataclasses.dataclass
+class _Coherence:
+    """Of bundles: nodes and leaves that they visit per ray, rays that enter one of them."""
+
+    visits: float
+    shared: float
+
+
+class DualTracer:
+    """Rays against a scene hierarchy, which is built anew when the geometry has changed.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    geometry : raystream.geometry.Geometry
+    memory_limit : int
+        Bytes that the scene hierarchy may take.
+    builder : {"auto", "fast", "quality"}
+        See `raystream.tree.SceneTree`. "auto" takes "fast", and "quality" once the rays traced
+        since the geometry changed outnumber the triangles three times.
+    traversal : {"auto", "single", "bundle", "stream"}
+        How rays walk the hierarchy. "auto" measures which is the fastest for the rays of each call.
+
+    Raises
+    ------
+    ValueError
+        An option that there is not.
+    raystream.errors.MemoryLimitError
+        The hierarchy needs more than `memory_limit`.
+
+    Notes
+    -----
+    `Statistics.levels` has two rows, nodes and leaves: ``nodes`` visits of them, by a ray, a bundle
+    or the rays of a stream that are there; ``tests`` of boxes there, ``hits`` boxes entered.
+    `Statistics.final_tests` counts triangles tested with a ray, `final_hits` those hit within the
+    ray's segment as far as it then reached.
+    """
+
+    def __init__(self, session, geometry, memory_limit, builder="auto", traversal="auto"):
+        check_choice("builder", builder, ("auto", *BUILDERS))
+        check_choice("traversal", traversal, TRAVERSALS)
+        self.session, self.geometry, self._memory_limit = session, geometry, memory_limit
+        self._builder, self._traversal = builder, traversal
+        self._trees, self._built, self._version, self._num_traced = {}, None, None, 0
+
+    def tree(self, num_rays=0):
+        """The `SceneTree` of the geometry as it is now, for so many rays to come."""
+        if self._version != self.geometry.version:
+            self._built, self._version, self._num_traced = None, self.geometry.version, 0
+        self._num_traced += num_rays
+        builder = self._builder
+        if builder == "auto":
+            many = self._num_traced >= _RAYS_OF_QUALITY * self.geometry.num_triangles
+            builder = "quality" if many or self._built == "quality" else "fast"
+        if builder not in self._trees:
+            self._trees[builder] = SceneTree(
+                self.session, self.geometry, builder, self._memory_limit
+            )
+        if builder != self._built:
+            self._trees[builder].build()
+            self._built = builder
+        return self._trees[builder]
+
+    def intersect(self, rays):
+        """Closest hits of `rays`; returns (HitStream, Statistics)."""
+        hits = HitStream.misses(self.session, len(rays))
+        return hits, self._trace("intersect", rays, hits.t, hits.triangle, hits.u, hits.v)
+
+    def occluded(self, rays):
+        """Whether anything lies in each ray's segment; returns (uint8 Array, Statistics)."""
+        blocked = not_blocked(self.session, len(rays))
+        return blocked, self._trace("occlude", rays, blocked)
+
+    def _trace(self, query, rays, *results):
+        self.tree(len(rays))
+        plan = self._plan(query, rays, results)
+        return self._statistics(self._run(query, plan, rays, results))
+
+    def _plan(self, query, rays, results):
+        """How to trace these rays, and in which order.
+
+        A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
+        stream costs what each ray's nodes and leaves cost. So it matters how many visits bundles
+        make, and how many rays share one: a few bundles, spread over all, are traced to see. First
+        in the given order, which may be good enough to save the sorting.
+        """
+        given = leaf_slots(self.session, rays)
+        if self._traversal == "auto":
+            if len(rays) < _FEW_RAYS:
+                return _Plan("single", given)
+            plan = _Plan("bundle", given)
+            if self._coherence(query, plan, rays, results).visits < _VISITS_WORTH_A_SORT:
+                return plan
+        elif rays.size is not None:
+            return _Plan(self._traversal, given)
+        hashed = sorted_slots(self.session, rays, given, DEFAULT_HASH)
+        if self._traversal != "auto":
+            return _Plan(self._traversal, hashed)
+        plan = _Plan("bundle", hashed)
+        shared = self._coherence(query, plan, rays, results).shared
+        return plan if shared >= _SHARED_BY_BUNDLE else _Plan("stream", hashed)
+
+    def _coherence(self, query, plan, rays, results):
+        counts = self._run(query, plan, rays, results, most=_SAMPLES)
+        visits = counts["nodes"] + counts["leaves"]
+        return _Coherence(visits / max(1, counts["rays"]), counts["boxes"] / max(1, visits))
+
+    def _run(self, query, plan, rays, results, most=None):
+        """Trace the rays, or up to `most` work-items' spread evenly; returns the counts."""
+        size, num_slots = _RAYS[plan.traversal], plan.slots.shape[0]
+        groups = -(-num_slots // size)
+        launched = groups if most is None else min(groups, most)
+        counts, tree = self.session.empty((launched, len(_COUNTS)), np.uint64), self.tree()
+        constants = {} if plan.traversal == "bundle" else {"RAYS": size}
+        self.session.launch(
+            TRAVERSAL,
+            self.session.kernels(_FILES[plan.traversal], **constants)[f"{query}_{plan.traversal}"],
+            launched,
+            np.uint32(num_slots),
+            np.uint32((groups // launched - 1) | 1),  # odd: no column of a screen alone
+            plan.slots,
+            rays.org_tnear,
+            rays.dir_tfar,
+            tree.nodes,
+            tree.leaves,
+            counts,
+            *results,
+        )
+        sums = (int(x) for x in counts.get().sum(axis=0, dtype=np.uint64))
+        return dict(zip(_COUNTS, sums, strict=True))
+
+    def _statistics(self, counts):
+        levels = [
+            {"nodes": nodes, "tests": tests, "hits": hits, "misses": tests - hits}
+            for nodes, tests, hits in (
+                (counts["nodes"], counts["box_tests"], counts["boxes"]),
+                (counts["leaves"], counts["leaf_tests"], counts["leaf_boxes"]),
+            )
+        ]
+        return Statistics(
+            levels=levels,
+            final_tests=counts["tests"],
+            final_hits=counts["hits"],
+            rays=counts["rays"],
+            triangles=self.geometry.num_triangles,
+            batches=1,
+            structure_bytes=self.tree().structure_bytes,
+        )

@@ -1,0 +1,129 @@
+"""The scene hierarchy of `dual`, built on the device every frame (cl/tree.cl).
+
+Its layout is in cl/tree.h.
+"""
+
+import numpy as np
+
+from raystream.checks import check_choice
+from raystream.errors import MemoryLimitError
+from raystream.sah import SurfaceAreaBuilder
+from raystream.sort import sort_by_key
+from raystream.statistics import HIERARCHY_CREATION
+
+BUILDERS = ("fast", "quality")
+_WIDTH, _NODE_ROWS, _LEAF_ROWS = 8, 8, 10  # cl/tree.h
+_NODE_BYTES, _LEAF_BYTES = 4 * _NODE_ROWS * _WIDTH, 4 * _LEAF_ROWS * _WIDTH
+_KEY_BITS = 30
+_BLOCK = 16
+_CHUNKS_PER_UNIT = 8
+
+
+class SceneTree:
+    """An eight-ary tree of boxes around the triangles of a geometry.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    geometry : raystream.geometry.Geometry
+    builder : {"fast", "quality"}
+        "fast": leaves are runs of eight triangles along a Hilbert curve. "quality": splits by the
+        surface area heuristic; takes about three times as long, and rays visit fewer nodes.
+    memory_limit : int, optional
+        Bytes that the tree and what it is built in may take.
+
+    Attributes
+    ----------
+    nodes : Array of shape (num_nodes, 8, 8) float32
+        Rows of eight lanes, a child each: low x, y, z, high x, y, z, the child's number (uint32).
+        Node 0 is the root; what no node names as a child means nothing.
+    leaves : Array of shape (num_leaves, 10, 8) float32
+        Rows of eight lanes, a triangle each: three vertices, the flat triangle's number (uint32).
+    structure_bytes : int
+        Of the tree and of what it is built in, without the arrays of the sort.
+
+    Raises
+    ------
+    ValueError
+        No such builder.
+    raystream.errors.MemoryLimitError
+        The tree needs more than `memory_limit`.
+    """
+
+    def __init__(self, session, geometry, builder="fast", memory_limit=None):
+        check_choice("builder", builder, BUILDERS)
+        self.session, self.geometry = session, geometry
+        self._chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
+        self._launch = _launcher(session, self._chunks)
+        count = geometry.num_triangles
+        if builder == "fast":
+            self._builder = _RunBuilder(count, self._launch)
+        else:
+            self._builder = SurfaceAreaBuilder(session, count)
+        num_nodes, num_leaves = self._builder.num_nodes, self._builder.num_leaves
+        padded = -(-count // _BLOCK) * _BLOCK
+        self.structure_bytes = (
+            num_nodes * _NODE_BYTES + num_leaves * _LEAF_BYTES + 8 * padded + self._builder.nbytes
+        )
+        if memory_limit is not None and self.structure_bytes > memory_limit:
+            raise MemoryLimitError(
+                f"scene hierarchy: {count} triangles need {self.structure_bytes} bytes "
+                f"of memory_limit {memory_limit}"
+            )
+        self.nodes = session.empty((num_nodes, _NODE_ROWS, _WIDTH), np.float32)
+        self.leaves = session.empty((num_leaves, _LEAF_ROWS, _WIDTH), np.float32)
+        self._boxes = session.empty((self._chunks, 2, 4), np.float32)
+        self._keys = session.empty(padded, np.uint32)
+        identity = np.arange(padded, dtype=np.uint32)
+        self._identity = session.upload(HIERARCHY_CREATION, identity)
+
+    def build(self):
+        """Build the tree of the geometry's vertices as they are now, in the same arrays."""
+        triangles, (keys, order) = self.geometry.triangles, self._sorted()
+        self._builder.build(triangles, keys, order, self.nodes, self.leaves)
+
+    def _sorted(self):
+        """The triangles in the order of the curve, and their places along it."""
+        count, triangles = np.uint32(self.geometry.num_triangles), self.geometry.triangles
+        if count == 0:
+            return self._keys, self._identity
+        self._launch("bound_middles", count, triangles, self._boxes)
+        self._launch("place_triangles", count, triangles, self._boxes, self._keys)
+        with self.session.clock.under(HIERARCHY_CREATION):
+            return sort_by_key(self.session, self._keys, self._identity, _KEY_BITS)
+
+
+def _launcher(session, chunks):
+    """A function that launches kernels of tree.cl by name, a work-item for each chunk."""
+    kernels = session.kernels("tree.cl", CHUNKS=chunks)
+    return lambda kernel, *args: session.launch(HIERARCHY_CREATION, kernels[kernel], chunks, *args)
+
+
+class _RunBuilder:
+    """Runs of eight triangles are leaves, runs of eight leaves nodes, and so on."""
+
+    nbytes = 0
+
+    def __init__(self, num_triangles, launch):
+        self._count, self._launch = num_triangles, launch
+        self.num_leaves = -(-num_triangles // _WIDTH)
+        self._levels = _levels(self.num_leaves)
+        self.num_nodes = sum(self._levels)
+
+    def build(self, triangles, keys, order, nodes, leaves):
+        """As that of `SurfaceAreaBuilder`."""
+        firsts = np.cumsum([0, *self._levels])
+        sizes = map(np.uint32, (self._count, self._levels[-1], firsts[-2]))
+        self._launch("make_leaves", *sizes, order, triangles, leaves, nodes)
+        for level in reversed(range(len(self._levels) - 1)):
+            above = self._levels[level], firsts[level]
+            below = self._levels[level + 1], firsts[level + 1]
+            self._launch("make_nodes", *map(np.uint32, above + below), nodes)
+
+
+def _levels(num_leaves):
+    """Nodes of each level, the root's first."""
+    levels = [max(1, -(-num_leaves // _WIDTH))]
+    while levels[0] > 1:
+        levels.insert(0, -(-levels[0] // _WIDTH))
+    return levels

@@ -1,0 +1,355 @@
+"""Method `dual`: every traversal answers as brute force does, bit for bit."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from raystream.baselines import EmbreeTracer
+from raystream.baselines.tolerance import differing
+from real_scenes import BUNNY, PATIO
+from soup import assert_same_hits, box, grid_of_rays, mesh_of, random_rays, triangle_soup
+
+import raystream as rs
+from raystream import device, program
+from raystream.rays import from_camera, from_numpy
+from raystream.statistics import HIERARCHY_CREATION, TRAVERSAL
+
+TRAVERSALS = ("single", "bundle", "stream", "auto")
+every_traversal = pytest.mark.parametrize("traversal", TRAVERSALS)
+
+
+def assert_exact(scene, *rays, traversals=TRAVERSALS, **options):
+    """Closest and any hits equal those of brute force; returns the closest."""
+    brute = rs.Tracer(scene, "brute")
+    hits, blocked = brute.intersect(*rays), brute.occluded(*rays)
+    for traversal in traversals:
+        dual = rs.Tracer(scene, "dual", traversal=traversal, **options)
+        assert_same_hits(dual.intersect(*rays), hits)
+        np.testing.assert_array_equal(dual.occluded(*rays), blocked)
+    return hits
+
+
+# ---- exactness ----
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 1009, 10007])
+@pytest.mark.parametrize("triangles", [1, 2, 8, 9, 500])
+def test_hits_equal_brute_force(rng, triangles, count):
+    scene = triangle_soup(rng, triangles)
+    assert_exact(scene, *random_rays(rng, count))
+    assert_exact(scene, *random_rays(rng, count), 0.01, 2.0)
+
+
+def moved(scale, offset, values):
+    return (scale * values + offset).astype(np.float32)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([1e-4, 0.05, 1.0, 30.0]),  # size of triangles
+    st.sampled_from(["any", "flat", "sliver", "point", "line"]),
+    st.sampled_from([(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 100.0), (1e-3, 100.0)]),
+    st.sampled_from([0.0, 1.0, 30.0, 3e3, 1e5, 1e7]),  # how far away the rays start
+)
+def test_no_hit_is_ever_lost(seed, size, shape, place, distance):
+    rng = np.random.default_rng(seed)
+    corners = rng.random((97, 1, 3)) + size * (rng.random((97, 3, 3)) - 0.5)
+    if shape == "flat":  # parallel to the axes and in front of each other
+        corners = np.round(8 * corners) / 8
+        corners[np.arange(97), :, rng.integers(0, 3, 97)] = rng.integers(0, 3, (97, 1)) / 2
+    elif shape == "sliver":
+        corners[:, 2] = corners[:, 0] + 1e-4 * rng.normal(size=(97, 3)) * size
+    elif shape == "point":
+        corners[::2] = corners[::2, :1]
+    elif shape == "line":
+        corners[::2, 2] = (corners[::2, 0] + corners[::2, 1]) / 2
+    corners = moved(*place, corners)
+    scene = rs.Scene([mesh_of("a", corners[:40]), mesh_of("b", corners[40:])])
+    weights = rng.dirichlet([0.5, 0.5, 0.5], 160)
+    weights[::3] = np.eye(3)[rng.integers(0, 3, len(weights[::3]))]  # at vertices
+    weights[1::3, 0] = 0  # about edges
+    aim = np.einsum("ij,ijk->ik", weights, corners[rng.integers(0, 97, 160)].astype(np.float64))
+    origins = moved(*place, 0.5 + (0.3 + distance) * rng.normal(size=(160, 3)))
+    directions = (aim - origins).astype(np.float32)
+    straight = rng.random(160) < 0.4  # along an axis, or in a plane of two
+    along = np.eye(3)[rng.integers(0, 3, 160)] * rng.choice([-1, 1], (160, 1))
+    along[::5] += np.roll(along[::5], 1, axis=1)
+    origins[straight] = aim[straight]
+    origins -= np.where(straight[:, None], along * distance * place[0], 0).astype(np.float32)
+    directions = np.where(straight[:, None], along, directions)
+    directions[~directions.any(axis=1)] = 1
+    directions = (directions * 10.0 ** rng.uniform(-3, 3, (160, 1))).astype(np.float32)
+    tnear = np.where(rng.random(160) < 0.7, 0, rng.random(160)).astype(np.float32)
+    tfar = np.where(rng.random(160) < 0.5, np.inf, 2 * rng.random(160)).astype(np.float32)
+    assert_exact(scene, origins, directions, tnear, tfar)
+
+
+def test_rays_along_the_faces_of_boxes():
+    """In faces, along edges, through vertices of boxes; zero components of both signs."""
+    steps = np.linspace(-0.25, 1.25, 25)
+    places = np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2)
+    for scene in (box(), boxes_in_a_grid(4)):
+        for axis in range(3):
+            origins = np.insert(places, axis, -1.0, axis=1)
+            directions = np.tile(np.eye(3)[axis], (len(places), 1))
+            directions[::2] = np.where(directions[::2] == 0, -0.0, directions[::2])
+            assert_exact(scene, origins, directions)
+            assert_exact(scene, origins, -directions)
+            assert_exact(scene, origins + 1.5 * directions, directions)
+
+
+def boxes_in_a_grid(count):
+    """Unit boxes that share their faces, scaled to the unit cube."""
+    unit = box().meshes[0]
+    offsets = np.stack(np.meshgrid(*[np.arange(count)] * 3), -1).reshape(-1, 3)
+    return rs.Scene([
+        rs.Mesh(((unit.vertices + o) / count).astype(np.float32), unit.faces, name=str(o))
+        for o in offsets
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("origin", [(0.1, 0.2, 0.3), (0.0, 0.0, 0.0), (1e-3, 0.0, 2.0)])
+def test_no_ray_at_an_edge_or_vertex_of_a_closed_mesh_misses(rng, origin):
+    """From inside, 10^5 rays: at vertices, edges' midpoints and edges' points of a sphere."""
+    scene = rs.scenes.mirror_ball((0.0, 0.0, 0.0), 5.0)
+    corners = scene.vertices[scene.faces].astype(np.float64)
+    weights = np.zeros((33_334, 3, 3))
+    weights[:, 0] = np.eye(3)[rng.integers(0, 3, len(weights))]
+    weights[:, 1] = (1 - np.eye(3)[rng.integers(0, 3, len(weights))]) / 2
+    weights[:, 2, 0] = rng.random(len(weights))
+    weights[:, 2, 1] = 1 - weights[:, 2, 0]
+    triangle = rng.integers(0, len(corners), len(weights))
+    aim = np.einsum("nkj,njx->nkx", weights, corners[triangle]).reshape(-1, 3)
+    for traversal in TRAVERSALS:
+        dual = rs.Tracer(scene, "dual", traversal=traversal)
+        origins = np.tile(np.float32(origin), (len(aim), 1))
+        assert (dual.intersect(origins, aim - origins).prim_id >= 0).all()
+        assert dual.occluded(origins, aim - origins, 0.0, 2.0).all()
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 1000, 4097])
+def test_all_triangles_in_one_place(rng, count):
+    """Duplicates: the smallest number wins; points and lines are never hit."""
+    triangle = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]]], np.float32)
+    rays = np.zeros((200, 3)), np.append(rng.random((200, 2)), np.ones((200, 1)), axis=1)
+    hits = assert_exact(rs.Scene([mesh_of("same", np.repeat(triangle, count, axis=0))]), *rays)
+    assert set(hits.prim_id) == {-1, 0}
+    point = rs.Scene([mesh_of("point", np.ones((count, 3, 3), np.float32))])
+    assert (assert_exact(point, *rays).prim_id == -1).all()
+
+
+def test_one_huge_triangle_among_tiny_ones(rng):
+    tiny = rng.random((1000, 1, 3)) + 0.02 * rng.random((1000, 3, 3))
+    tiny[500] = [[-1e4, -1e4, 0.4], [1e4, -1e4, 0.5], [0, 1e4, 0.6]]
+    scene = rs.Scene([mesh_of("all", tiny.astype(np.float32))])
+    triangles = assert_exact(scene, *random_rays(rng, 2000)).prim_id
+    assert (triangles == 500).any() and ((triangles >= 0) & (triangles != 500)).any()
+
+
+def test_a_flat_scene(rng):
+    flat = rng.random((1000, 1, 3)) + 0.1 * rng.random((1000, 3, 3))
+    flat[:, :, 1] = 0.25
+    rays = random_rays(rng, 2000)
+    rays[1][::4, 1] = 0
+    rays[0][::8, 1] = 0.25
+    assert_exact(rs.Scene([mesh_of("flat", flat.astype(np.float32))]), *rays)
+
+
+def test_equal_distances_go_to_the_smaller_triangle(rng):
+    """Every triangle three times, in another order of meshes."""
+    meshes = triangle_soup(rng, 200).meshes
+    scene = rs.Scene([*meshes, *meshes[::-1], *meshes])
+    assert_exact(scene, *random_rays(rng, 2000, spread=0.2))
+
+
+def test_rays_from_afar_and_of_extreme_length(rng):
+    scene = triangle_soup(rng, 200)
+    aim = scene.vertices[rng.integers(0, len(scene.vertices), 200)]
+    away = rng.normal(size=(200, 3)) * 10.0 ** rng.uniform(-2, 9, (200, 1))
+    directions = -away * 10.0 ** rng.uniform(-20, 8, (200, 1))
+    assert_exact(scene, aim + away, directions)
+
+
+@every_traversal
+def test_inactive_rays_hit_nothing(rng, traversal):
+    scene = triangle_soup(rng, 300)
+    origins, directions = random_rays(rng, 500, spread=0.0)
+    tfar = np.where(np.arange(500) % 3 == 0, 0.5, np.inf)
+    dual = rs.Tracer(scene, "dual", traversal=traversal)
+    hits = dual.intersect(origins, directions, 1.0, tfar)
+    assert (hits.prim_id[::3] == -1).all()
+    assert dual.statistics.rays == 333 and (hits.prim_id >= 0).any()
+    assert not dual.occluded(origins, directions, 1.0, tfar)[::3].any()
+
+
+def test_rays_of_one_origin(rng):
+    """Shadow rays, as from a light: any hit and closest hit, with an end and without."""
+    scene = triangle_soup(rng, 2000, size=0.05)
+    light = np.tile(np.float32([0.5, 2.0, 0.5]), (4000, 1))
+    ends = rng.random((4000, 3)).astype(np.float32)
+    assert_exact(scene, light, ends - light, 0.0, 1.0)
+    assert_exact(scene, light, ends - light)
+
+
+@every_traversal
+@pytest.mark.parametrize("size", [(64, 64), (37, 23), (1, 1), (130, 9)])
+def test_rays_of_a_screen(rng, session, traversal, size):
+    scene, stream = triangle_soup(rng, 2000, size=0.1), grid_of_rays(*size)
+    dual, brute = rs.Tracer(scene, "dual", traversal=traversal), rs.Tracer(scene, "brute")
+    ours, theirs = (t.intersect_stream(session, stream) for t in (dual, brute))
+    for field in ("t", "triangle", "u", "v"):
+        np.testing.assert_array_equal(
+            *(getattr(hits, field).get() for hits in (ours, theirs)), field
+        )
+    assert dual.statistics.rays == size[0] * size[1]
+
+
+@pytest.mark.parametrize("real", [BUNNY, PATIO], ids=lambda real: real.name)
+def test_real_scenes(scene_folder, session, rng, real):
+    scene = real.load(scene_folder)
+    stream = from_camera(session, real.camera, (48, 48))
+    low, high = scene.vertices.min(axis=0), scene.vertices.max(axis=0)
+    origins = low + (high - low) * rng.random((2000, 3))
+    inside = from_numpy(session, origins, rng.normal(size=(2000, 3)), 0.0, np.inf)
+    brute = rs.Tracer(scene, "brute")
+    for rays in (stream, inside):
+        theirs = brute.intersect_stream(session, rays)
+        blocked = brute.occluded_stream(session, rays).get()
+        assert np.isfinite(theirs.t.get()).sum() > 200
+        for traversal in TRAVERSALS:
+            dual = rs.Tracer(scene, "dual", traversal=traversal)
+            ours = dual.intersect_stream(session, rays)
+            for field in ("t", "triangle", "u", "v"):
+                left, right = (getattr(hits, field).get() for hits in (ours, theirs))
+                np.testing.assert_array_equal(left, right, field)
+            np.testing.assert_array_equal(dual.occluded_stream(session, rays).get(), blocked)
+
+
+def test_embree_agrees(rng):
+    scene = triangle_soup(rng, 20_000, size=0.03)
+    triangles = (scene.vertices, scene.faces, scene.first_prims)
+    rays = random_rays(rng, 20_000)
+    expected = EmbreeTracer.from_scene(scene).intersect(*rays)
+    for traversal in TRAVERSALS:
+        hits = rs.Tracer(scene, "dual", traversal=traversal).intersect(*rays)
+        agreement = differing(hits, expected, *triangles, *rays)
+        assert agreement.num_wrong == 0, (traversal, agreement)
+
+
+# ---- frames, counts, options ----
+
+
+@every_traversal
+def test_moving_vertices(rng, traversal):
+    scene, rays = triangle_soup(rng, 300), random_rays(rng, 500)
+    dual, brute = rs.Tracer(scene, "dual", traversal=traversal), rs.Tracer(scene, "brute")
+    for vertices in (scene.vertices, scene.vertices[::-1] * [1, 2, 3], scene.vertices * 0):
+        dual.update_vertices(vertices)
+        brute.update_vertices(vertices)
+        assert_same_hits(dual.intersect(*rays), brute.intersect(*rays))
+
+
+def test_a_tree_is_made_once_a_frame_and_takes_no_new_memory(rng, session):
+    dual = rs.Tracer(triangle_soup(rng, 300), "dual")
+    rays = random_rays(rng, 100)
+    dual.intersect(*rays)
+    assert {HIERARCHY_CREATION, TRAVERSAL} <= set(dual.statistics.stages)
+    dual.occluded(*rays)
+    assert HIERARCHY_CREATION not in dual.statistics.stages
+    held = None
+    for _ in range(3):
+        dual.update_vertices(dual.scene.vertices)
+        dual.intersect(*rays)
+        assert HIERARCHY_CREATION in dual.statistics.stages
+        assert held is None or session.pool.managed_bytes == held
+        held = session.pool.managed_bytes
+
+
+@every_traversal
+def test_counts(rng, traversal):
+    scene, rays = triangle_soup(rng, 3000, size=0.05), random_rays(rng, 3000)
+    dual, again = (rs.Tracer(scene, "dual", traversal=traversal) for _ in range(2))
+    hits = dual.intersect(*rays)
+    counts = dual.statistics
+    assert counts.rays == 3000 and counts.triangles == 3000 and counts.batches == 1
+    assert (hits.prim_id >= 0).sum() <= counts.final_hits <= counts.final_tests
+    assert counts.final_tests < 0.02 * 3000 * 3000
+    for level in counts.levels:
+        assert level["hits"] + level["misses"] == level["tests"]
+    assert counts.structure_bytes > 3000 * 40
+    again.intersect(*rays)
+    for name in ("levels", "final_tests", "final_hits"):
+        assert getattr(again.statistics, name) == getattr(counts, name)
+
+
+def test_auto_takes_the_traversal_that_suits_the_rays(rng, session):
+    """Few rays alone, a camera's as bundles, scattered ones as a stream: the counts tell."""
+    scene = triangle_soup(rng, 20_000, size=0.02)
+    scattered = from_numpy(session, *random_rays(rng, 20_000), 0.0, np.inf)
+    few = from_numpy(session, *random_rays(rng, 500), 0.0, np.inf)
+    cases = (("single", few), ("bundle", grid_of_rays(128, 128)), ("stream", scattered))
+    for traversal, rays in cases:
+        counts = []
+        for choice in ("auto", *TRAVERSALS[:3]):
+            dual = rs.Tracer(scene, "dual", builder="fast", traversal=choice)
+            dual.intersect_stream(session, rays)
+            counts.append(dual.statistics.levels[0])
+        auto, *others = counts
+        assert auto == others[TRAVERSALS.index(traversal)], traversal
+        assert sum(auto == other for other in others) == 1
+
+
+def test_the_better_builder_is_taken_for_many_rays(rng):
+    scene, rays = triangle_soup(rng, 1000), random_rays(rng, 1600)
+    auto, fast, quality = (rs.Tracer(scene, "dual", builder=b) for b in ("auto", "fast", "quality"))
+    for expected in (fast, quality, quality):  # 1.6, 3.2, 4.8 rays to a triangle
+        for tracer in (auto, expected):
+            tracer.intersect(*rays)
+        assert auto.statistics.levels == expected.statistics.levels
+    auto.update_vertices(scene.vertices)
+    auto.intersect(*rays)
+    fast.intersect(*rays)
+    assert auto.statistics.levels == fast.statistics.levels
+
+
+def test_single_rays_count_what_they_visit():
+    """A ray that misses the scene meets the root; one triangle is one node and one leaf."""
+    scene = rs.Scene([mesh_of("one", np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]]], np.float32))])
+    dual = rs.Tracer(scene, "dual", traversal="single")
+    dual.intersect([[0.2, 0.2, 0], [5, 5, 0]], [[0, 0, 1]] * 2)
+    nodes, leaves = dual.statistics.levels
+    assert nodes == {"nodes": 2, "tests": 16, "hits": 1, "misses": 15}
+    assert leaves["nodes"] == 1 and dual.statistics.final_tests == 8
+    assert dual.statistics.final_hits == 1
+
+
+@every_traversal
+def test_the_portable_path_is_the_same(rng, monkeypatch, traversal):
+    scene, rays = triangle_soup(rng, 400, size=0.3), random_rays(rng, 1009)
+    first = rs.Tracer(scene, "dual", traversal=traversal)
+    expected, blocked = first.intersect(*rays), first.occluded(*rays)
+    monkeypatch.setattr(program, "_OPTIONS", (*program._OPTIONS, "-DPORTABLE"))
+    monkeypatch.setattr(device, "_thread", type(device._thread)())
+    second = rs.Tracer(scene, "dual", traversal=traversal)
+    assert_same_hits(second.intersect(*rays), expected)
+    np.testing.assert_array_equal(second.occluded(*rays), blocked)
+    assert second.statistics.final_tests == first.statistics.final_tests
+    assert second.statistics.levels == first.statistics.levels
+
+
+def test_it_renders():
+    scene = rs.scenes.cornell()
+    images = [rs.render(scene, size=(48, 48), method=m).image for m in ("brute", "dual")]
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"traversal": "packet"}, "traversal: need one of 'auto', 'single', .*, got 'packet'"),
+    ({"builder": "sah"}, "builder: need one of .*, got 'sah'"),
+    ({"arity": 4}, "method 'dual' has no option 'arity'; its options: builder, traversal"),
+], ids=str)  # fmt: skip
+def test_options_that_there_are_not(rng, options, message):
+    with pytest.raises(ValueError, match=message) as error:
+        rs.Tracer(triangle_soup(rng, 10), "dual", **options)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,175 @@
+"""The scene hierarchy of `dual`: each triangle in one leaf, tight boxes, bounded depth."""
+
+import numpy as np
+import pytest
+from soup import mesh_of, triangle_soup
+
+import raystream as rs
+from raystream import device, program
+from raystream.errors import MemoryLimitError
+from raystream.geometry import Geometry
+from raystream.tree import BUILDERS, SceneTree
+
+LEAF, NO_CHILD, DEPTH = 0x80000000, 0xFFFFFFFF, 24  # cl/tree.h
+SIZES = (1, 2, 7, 8, 9, 15, 16, 17, 63, 64, 65, 127, 128, 511, 512, 513, 1009, 5003, 40009)
+
+
+@pytest.fixture(params=BUILDERS)
+def builder(request):
+    return request.param
+
+
+def tree_of(session, scene, builder, **options):
+    tree = SceneTree(session, Geometry(session, scene), builder, **options)
+    tree.build()
+    return tree
+
+
+def scene_of(corners):
+    return rs.Scene([mesh_of("soup", np.asarray(corners, np.float32))])
+
+
+def boxes_and_numbers(tree):
+    """Boxes (n, 8, 2, 3) of the nodes' children and their numbers (n, 8); the leaves' triangles."""
+    nodes, leaves = tree.nodes.get(), tree.leaves.get()
+    boxes = nodes[:, :6].reshape(-1, 2, 3, 8).transpose(0, 3, 1, 2)
+    children = np.ascontiguousarray(nodes[:, 6]).view(np.uint32)
+    corners = leaves[:, :9].reshape(-1, 3, 3, 8).transpose(0, 3, 1, 2)
+    return boxes, children, corners, np.ascontiguousarray(leaves[:, 9]).view(np.uint32)
+
+
+def check(tree, scene):
+    """What cl/tree.h says of a tree; returns the number of levels of its nodes."""
+    triangles = scene.vertices[scene.faces]
+    boxes, children, corners, numbers = boxes_and_numbers(tree)
+    used = children != NO_CHILD
+    level, depth, found = np.array([0]), 0, []
+    while len(level):
+        depth += 1
+        assert len(np.unique(level)) == len(level)
+        empty = boxes[level][~used[level]]
+        assert (empty[:, 0] == np.inf).all() and (empty[:, 1] == -np.inf).all()
+        node, lane = np.nonzero(used[level])
+        box, child = boxes[level[node], lane], children[level[node], lane]
+        is_leaf = (child & LEAF) != 0
+        leaf = child[is_leaf] & ~np.uint32(LEAF)
+        found.append(numbers[leaf])
+        real = numbers[leaf] != NO_CHILD
+        assert real.any(axis=1).all()
+        assert np.isnan(corners[leaf][~real]).all()
+        np.testing.assert_array_equal(corners[leaf][real], triangles[numbers[leaf][real]])
+        np.testing.assert_array_equal(box[is_leaf, 0], np.nanmin(corners[leaf], axis=(1, 2)))
+        np.testing.assert_array_equal(box[is_leaf, 1], np.nanmax(corners[leaf], axis=(1, 2)))
+        inner = child[~is_leaf]
+        np.testing.assert_array_equal(box[~is_leaf, 0], boxes[inner, :, 0].min(axis=1))
+        np.testing.assert_array_equal(box[~is_leaf, 1], boxes[inner, :, 1].max(axis=1))
+        level = inner
+    assert depth <= DEPTH
+    found = np.concatenate(found).ravel()
+    found = np.sort(found[found != NO_CHILD])
+    np.testing.assert_array_equal(found, np.arange(scene.num_triangles))
+    return depth
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_each_triangle_is_in_one_leaf_and_boxes_are_tight(session, rng, builder, count):
+    scene = triangle_soup(rng, count, size=0.1)
+    check(tree_of(session, scene, builder), scene)
+
+
+DEGENERATE = {
+    "one point": lambda rng: np.full((3001, 3, 3), 0.25),
+    "duplicates": lambda rng: np.tile(rng.random((1, 3, 3)), (4099, 1, 1)),
+    "flat": lambda rng: rng.random((3001, 3, 3)) * (1, 1, 0),
+    "on a line": lambda rng: rng.random((3001, 3, 3)) * (0, 1, 0),
+    "one huge": lambda rng: np.concatenate([
+        1e-3 * rng.random((3000, 3, 3)), 1e6 * rng.normal(size=(1, 3, 3))
+    ]),
+    "growing": lambda rng: 1.02 ** np.arange(3000)[:, None, None] * rng.normal(size=(3000, 3, 3)),
+    "at the end of float": lambda rng: 3e38 * (2 * rng.random((999, 3, 3)) - 1),
+    "tiny": lambda rng: 1e-42 * rng.random((999, 3, 3)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_scenes(session, rng, builder, name):
+    scene = scene_of(DEGENERATE[name](rng))
+    check(tree_of(session, scene, builder), scene)
+
+
+def test_depth_is_bounded_where_splits_peel_off_leaf_after_leaf(session, rng):
+    # The far triangle puts all others in one cell of the curve, hence one task: 14 levels, and one
+    # above it (cl/sah.cl). Without the bound there are 17.
+    growing = 1.02 ** np.arange(3000)[:, None, None] * (1 + 1e-3 * rng.random((3000, 3, 3)))
+    scene = scene_of(np.concatenate([growing, np.full((1, 3, 3), 3e37)]))
+    assert check(tree_of(session, scene, "quality"), scene) == 15
+
+
+def test_an_empty_scene_has_a_root_without_children(session, builder):
+    tree = tree_of(session, scene_of(np.empty((0, 3, 3))), builder)
+    boxes, children, *_ = boxes_and_numbers(tree)
+    assert (children[0] == NO_CHILD).all() and (boxes[0, :, 0] > boxes[0, :, 1]).all()
+
+
+def arrays(tree):
+    return tree.nodes.get().view(np.uint32), tree.leaves.get().view(np.uint32)
+
+
+def reachable(tree):
+    """The arrays without nodes and leaves that no parent names: these mean nothing."""
+    _, children, *_ = boxes_and_numbers(tree)
+    level, nodes, leaves = np.array([0]), [], []
+    while len(level):
+        nodes.append(level)
+        child = children[level]
+        child = child[child != NO_CHILD]
+        leaves.append(child[(child & LEAF) != 0] & ~np.uint32(LEAF))
+        level = child[(child & LEAF) == 0]
+    at = np.sort(np.concatenate(nodes)), np.sort(np.concatenate(leaves).astype(np.int64))
+    return [array[rows] for array, rows in zip(arrays(tree), at, strict=True)]
+
+
+def assert_same_tree(first, second):
+    for a, b in zip(reachable(first), reachable(second), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_second_build_gives_the_same_tree(session, rng, builder):
+    scene = triangle_soup(rng, 20011, size=0.1)
+    tree = tree_of(session, scene, builder)
+    before = reachable(tree)
+    tree.build()
+    for a, b in zip(before, reachable(tree), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_new_vertices_give_the_tree_of_a_new_scene(session, rng, builder):
+    scene, moved = triangle_soup(rng, 3001), triangle_soup(rng, 3001)
+    geometry = Geometry(session, scene)
+    tree = SceneTree(session, geometry, builder)
+    tree.build()
+    geometry.update(moved.vertices)
+    tree.build()
+    check(tree, moved)
+    assert_same_tree(tree, tree_of(session, moved, builder))
+
+
+def test_the_portable_path_gives_the_same_tree(session, rng, builder, monkeypatch):
+    scene = triangle_soup(rng, 5003, size=0.1)
+    expected = tree_of(session, scene, builder)
+    monkeypatch.setattr(program, "_OPTIONS", (*program._OPTIONS, "-DPORTABLE"))
+    monkeypatch.setattr(device, "_thread", type(device._thread)())
+    assert_same_tree(tree_of(device.session(), scene, builder), expected)
+
+
+def test_too_little_memory_is_refused_with_what_is_needed(session, rng, builder):
+    scene = triangle_soup(rng, 1009)
+    needed = tree_of(session, scene, builder).structure_bytes
+    tree_of(session, scene, builder, memory_limit=needed)
+    with pytest.raises(MemoryLimitError, match=f"1009 triangles need {needed} bytes"):
+        tree_of(session, scene, builder, memory_limit=needed - 1)
+
+
+def test_unknown_builders_are_refused(session, rng):
+    with pytest.raises(ValueError, match="builder: need one of 'fast', 'quality'"):
+        SceneTree(session, Geometry(session, triangle_soup(rng, 9)), "best")
