@@ -107,7 +107,7 @@ inline void prepare(Packet *p, uint side, float4 scene_low, float4 scene_high)
     for (uint axis = 0; axis < 3; axis++)
         p->direction[axis] = sum_lanes(total[axis]);
     p->frustum.valid = false;
-    if (p->least_active)
+    if (p->least_active != 0 && p->count >= p->least_active) // else no one would ask
         bound_packet(&p->frustum, p->rays, p->count, p->direction, side, scene_low, scene_high);
 }
 
