@@ -2,6 +2,7 @@
 
     RAYSTREAM_SCENES=... python tests/bench/bench_ldc.py --pictures FOLDER
     RAYSTREAM_SCENES=... python tests/bench/bench_ldc.py --tolerance FOLDER
+    RAYSTREAM_SCENES=... python tests/bench/bench_ldc.py --gaps
     RAYSTREAM_SCENES=... python tests/bench/bench_ldc.py --exact
     RAYSTREAM_SCENES=... python tests/bench/bench_ldc.py --table
     RAYSTREAM_SCENES=... python tests/bench/bench_ldc.py --growth FOLDER
@@ -23,6 +24,7 @@ import pytest
 sys.path.insert(0, str(pathlib.Path(__file__).parent.parent))
 
 from cube_map import CubeMap, render_cube_map
+from ldc_gaps import find_gaps
 from ldc_pictures import ANSWERS, AS_TRACED, REASONS, judge
 from ldc_scenes import SCENES
 from ldc_times import (
@@ -134,6 +136,17 @@ def scores_by_tolerance(scene, size):
         judge(scene, size, reference, (AS_TRACED,), tolerance=tolerance).ssim[AS_TRACED]
         for tolerance in tolerances
     ]
+
+
+def gaps(options):
+    """Where `options.rays` rays from around each scene slip between planes, at 512."""
+    print("| scene | hits | slip through | of them near an edge | at a turn | of all hits |")
+    for name in tqdm(chosen(options, SCENES), disable=None):
+        scene, rng = SCENES[name](options.folder), np.random.default_rng(2007)
+        found = find_gaps(scene, *rays_into(scene, rng, options.rays), **MODES[PLANES])
+        print(f"| {name} | {found.hits} | {found.slipped} | {found.near_edge:.0%} "
+              f"| {found.at_turn:.0%} | {found.hits_at_turn:.0%} |", flush=True)  # fmt: skip
+    return 0
 
 
 # ---- the exact mode: rays against Embree ----
@@ -337,6 +350,7 @@ def verdict(what, names):
 PARTS = {
     "pictures": pictures,
     "tolerance": tolerances,
+    "gaps": gaps,
     "exact": exact,
     "table": table,
     "growth": growths,
@@ -353,7 +367,7 @@ def parse():
             kind = {"type": pathlib.Path, "metavar": "FOLDER"}
         parser.add_argument(f"--{part.replace('_', '-')}", help=run.__doc__.split("\n")[0], **kind)
     parser.add_argument("--scenes", help="some of the scenes, by name", default="")
-    parser.add_argument("--rays", type=int, default=100_000, help="of each kind, for --exact")
+    parser.add_argument("--rays", type=int, default=100_000, help="of --gaps, each kind of --exact")
     parser.add_argument("--size", default="512x512", help="of the frames of --blocks")
     options = parser.parse_args()
     options.folder = os.environ.get("RAYSTREAM_SCENES")
