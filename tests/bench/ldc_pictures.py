@@ -1,18 +1,18 @@
-"""Pictures by `ldc` as published, held against the reference renderer, and why they differ."""
+"""Pictures by `ldc` from samples, held against the reference renderer, and why they differ."""
 
 import dataclasses
 
 import numpy as np
-from raystream.baselines import EmbreeTracer, render_reference
+from raystream.baselines import EmbreeTracer
 from raystream.baselines.tolerance import ssim
 
 import raystream as rs
 
-APART = 0.005  # of the scene's diagonal: five tolerances
+APART = 0.005  # of the scene's diagonal: five of the published tolerance
 REASONS = ("missed", "phantom", "early", "late")
-# What becomes of the published answers: taken as they are; the wrong ones replaced by Embree's, so
-# that only inexact hits are left; the others replaced, so that only wrong ones are.
-PUBLISHED, NO_WRONG, ONLY_WRONG = ANSWERS = ("published", "no wrong hits", "only wrong hits")
+# What becomes of the answers: taken as they are; the wrong ones replaced by Embree's, so that only
+# inexact hits are left; the others replaced, so that only wrong ones are.
+AS_TRACED, NO_WRONG, ONLY_WRONG = ANSWERS = ("as traced", "no wrong hits", "only wrong hits")
 
 
 @dataclasses.dataclass
@@ -42,7 +42,7 @@ class WrongHits:
 
 
 class JudgedTracer:
-    """`ldc` as published beside Embree, for `rs.render`: every answer is judged.
+    """`ldc` beside Embree, for `rs.render`: every answer is judged.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class JudgedTracer:
         Of reflected and refracted rays, and of shadow rays.
     """
 
-    def __init__(self, scene, answer=PUBLISHED, **options):
+    def __init__(self, scene, answer=AS_TRACED, **options):
         self._ldc, self._embree = rs.Tracer(scene, "ldc", **options), EmbreeTracer.from_scene(scene)
         self._apart, self._answer = APART * scene.diagonal, answer
         self.closest, self.shadow = WrongHits(), WrongHits()
@@ -90,7 +90,7 @@ class JudgedTracer:
         return expected & ~hit, hit & ~expected, gap < -self._apart, gap > self._apart
 
     def _by_embree(self, wrong):
-        if self._answer == PUBLISHED:
+        if self._answer == AS_TRACED:
             return np.zeros_like(wrong)
         return wrong if self._answer == NO_WRONG else ~wrong
 
@@ -100,13 +100,12 @@ class Judgement:
     """A picture of one scene in one size: SSIM by kind of answer, and the wrong hits."""
 
     image: np.ndarray
-    reference: np.ndarray
     ssim: dict
     closest: WrongHits
     shadow: WrongHits
 
 
-def judge(scene, size, answers=ANSWERS, reference=None, **options):
+def judge(scene, size, reference, answers=ANSWERS, **options):
     """Render a scene by `ldc` with as many texels as pixels; returns a `Judgement`.
 
     Parameters
@@ -114,15 +113,13 @@ def judge(scene, size, answers=ANSWERS, reference=None, **options):
     scene : raystream.Scene
     size : int
         Pixels along each edge of the picture, and texels along each edge of the cube.
+    reference : (size, size, 3) float
+        The picture by the reference renderer.
     answers : sequence of str
         Of ANSWERS; the first is the picture that is kept.
-    reference : (size, size, 3) float, optional
-        By the reference renderer; made where it is not given.
     **options
         Of `ldc`.
     """
-    if reference is None:
-        reference = render_reference(scene, scene.camera, (size, size)).image
     runs = {}
     for answer in answers:
         tracer = JudgedTracer(scene, answer, **{"resolution": size, **options})
@@ -130,4 +127,4 @@ def judge(scene, size, answers=ANSWERS, reference=None, **options):
         runs[answer] = image, tracer
     image, tracer = runs[answers[0]]
     similar = {answer: ssim(run[0], reference) for answer, run in runs.items()}
-    return Judgement(image, reference, similar, tracer.closest, tracer.shadow)
+    return Judgement(image, similar, tracer.closest, tracer.shadow)

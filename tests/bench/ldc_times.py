@@ -21,6 +21,9 @@ from raystream.statistics import TRAVERSAL
 RESOLUTIONS = (512, 1024)
 VIEWPORT = (1280, 1024)  # of the paper
 ROUNDS = 9
+# What a ray of `ldc` hits: samples as published, samples as planes (the default), triangles.
+PUBLISHED, PLANES, EXACT = "as published", "planes", "exact"
+MODES = {PUBLISHED: {"tolerance": 0.001}, PLANES: {}, EXACT: {"exact": True}}
 GROWTH_RAYS = 1 << 18
 
 
@@ -79,22 +82,41 @@ class TableRow:
     construction: float
     tracing: float
     traversal: float
+    traversal_published: float
     rays: int
 
 
 def table_row(scene, resolution):
-    """Column A: construction. Column B: a frame in the paper's viewport, the cube being there."""
+    """Column A: construction. Column B: a frame in the paper's viewport, the cube being there.
+
+    By planes, and the time in traversal as published, too, in turn.
+    """
     builder = Builder(scene, resolution=resolution)
     (construction,) = in_turn(builder.build)
-    renderer = rs.Renderer(scene, "ldc", resolution=resolution)
-    frames = []
-    (tracing,) = in_turn(lambda: frames.append(renderer.render(size=VIEWPORT)), rounds=3)
-    counts = frames[-1].statistics
-    traversal = statistics.median(f.statistics.stages[TRAVERSAL]["device"] for f in frames[1:])
+    planes, as_published = (Frames(scene, resolution, mode) for mode in (PLANES, PUBLISHED))
+    tracing, _ = in_turn(planes.render, as_published.render, rounds=3)
     return TableRow(
         scene.num_triangles, builder.cube.layers, builder.cube.num_samples,
-        float(np.median(construction)), float(np.median(tracing)), traversal, counts.rays,
+        float(np.median(construction)), float(np.median(tracing)), planes.traversal,
+        as_published.traversal, planes.statistics[-1].rays,
     )  # fmt: skip
+
+
+class Frames:
+    """Renders a frame in the paper's viewport, again and again."""
+
+    def __init__(self, scene, resolution, mode):
+        self._renderer = rs.Renderer(scene, "ldc", resolution=resolution, **MODES[mode])
+        self.statistics = []
+
+    def render(self):
+        """A frame, of which the statistics are kept."""
+        self.statistics.append(self._renderer.render(size=VIEWPORT).statistics)
+
+    @property
+    def traversal(self):
+        """Median device seconds in traversal of all frames but the first."""
+        return statistics.median(s.stages[TRAVERSAL]["device"] for s in self.statistics[1:])
 
 
 def published():
