@@ -19,7 +19,7 @@ lint: $(VENV)/ready  ## Check style.
 
 demo: $(VENV)/ready  ## Render a procedural scene, check it against Embree, write demo/*.png.
 	mkdir -p demo
-	$(BIN)/raystream compare demo --methods crsh,rsh,embree -o demo
+	$(BIN)/raystream compare demo --methods dual,packet,crsh,rsh,embree -o demo
 
 bench: $(VENV)/ready  ## Run the benchmarks (performance is measured here, never in tests).
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'

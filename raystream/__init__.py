@@ -1,7 +1,7 @@
 """Ray queries and Whitted rendering in OpenCL for scenes that change every frame.
 
 >>> import raystream as rs
->>> frame = rs.render(rs.scenes.demo(), size=(640, 360), method="crsh")
+>>> frame = rs.render(rs.scenes.demo(), size=(640, 360))
 >>> frame.save("demo.png")
 """
 

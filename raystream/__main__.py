@@ -18,7 +18,7 @@ from raystream.errors import BuildError, DeviceError
 from raystream.light import PointLight
 from raystream.renderer import PRIMARY_VISIBILITY, Renderer, parse_method
 from raystream.scene import load_scene
-from raystream.tracer import methods
+from raystream.tracer import AUTO, methods
 
 # Procedural scenes by name; "name:argument" passes a number or a variant.
 PROCEDURAL = {
@@ -50,7 +50,7 @@ _RENDER_EXAMPLES = """examples:
   raystream render sponza.obj -o atrium.png --eye -12,4,0 --target 0,3,1 --mirror-ball 0,2,0,1.5
 """
 _COMPARE_EXAMPLES = """examples:
-  raystream compare demo --methods crsh,rsh,embree -o demo
+  raystream compare demo --methods dual,crsh,embree -o demo
   raystream compare bunny.ply --methods rsh,brute,embree --mirror '*'
   raystream compare cornell --methods rsh:arity=8:levels=2,rsh --counts
 """
@@ -106,7 +106,9 @@ def _add_render(commands):
     _add_scene(command)
     command.add_argument("-o", "--output", required=True, help="picture: .png .jpg .exr .npy")
     command.add_argument(
-        "--method", default="crsh", help=f"one of {', '.join(methods())}; {_METHOD_HELP}"
+        "--method",
+        default=AUTO,
+        help=f"one of {', '.join(methods())}, {AUTO} (default: %(default)s); {_METHOD_HELP}",
     )
     command.add_argument("--samples", type=int, default=1, help="samples per pixel")
     command.add_argument(
@@ -133,7 +135,7 @@ def _add_compare(commands):
     _add_scene(command)
     command.add_argument(
         "--methods",
-        default="crsh,rsh,embree",
+        default="dual,crsh,rsh,embree",
         help=f"of {', '.join(methods())} and embree, with commas between (default: %(default)s); "
         + _METHOD_HELP,
     )
@@ -238,7 +240,7 @@ def _render(options):
     path = images.check_suffix(options.output)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: no such folder")
-    method, method_options = parse_method(options.method, methods())
+    method, method_options = parse_method(options.method, (*methods(), AUTO))
     scene = _scene(options)
     camera = _camera(options, scene)
     renderer = Renderer(scene, method, **method_options)

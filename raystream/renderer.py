@@ -16,7 +16,7 @@ from raystream.rasterize import Rasterizer
 from raystream.scene import as_scene
 from raystream.shade import Shader
 from raystream.statistics import SHADING, Statistics
-from raystream.tracer import Tracer
+from raystream.tracer import AUTO, Tracer
 
 SHADOW, REFLECTION, REFRACTION = RAY_KINDS = ("shadow", "reflection", "refraction")
 PRIMARY = "primary"
@@ -61,7 +61,7 @@ def render(
     scene,
     camera=None,
     size=(512, 512),
-    method="crsh",
+    method=AUTO,
     max_bounces=2,
     shadows=True,
     samples=1,
@@ -80,7 +80,8 @@ def render(
     size : (int, int)
         (width, height) in pixels.
     method : str or tracer
-        One of `methods`, a `Tracer`, or an object of the same protocol, such as an `EmbreeTracer`.
+        One of `methods`, "auto", a `Tracer`, or an object of the same protocol, such as an
+        `EmbreeTracer`.
     max_bounces : int
         Generations of reflection and refraction rays.
     shadows : bool
@@ -120,7 +121,7 @@ class Renderer:
         As for `render`.
     """
 
-    def __init__(self, scene, method="crsh", device=None, **options):
+    def __init__(self, scene, method=AUTO, device=None, **options):
         self.scene = as_scene(scene)
         self._tracer = _tracer(self.scene, method, device, options)
         if device is None and isinstance(self._tracer, Tracer):

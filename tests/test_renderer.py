@@ -208,7 +208,9 @@ def test_traced_primary_visibility_is_that_of_the_rasteriser():
     assert twice.kinds["primary"].rays == 2 * 64 * 48
 
 
-@pytest.mark.parametrize("options", [{}, {"arity": 8, "levels": 2}, {"method": "brute"}], ids=str)
+@pytest.mark.parametrize("options", [
+    {}, {"method": "crsh", "arity": 8, "levels": 2}, {"method": "brute"}
+], ids=str)  # fmt: skip
 def test_the_kinds_of_ray_add_up_to_the_frame(options):
     frame = rs.render(rs.scenes.demo(), size=(48, 32), max_bounces=3, samples=2, **options)
     kinds = frame.kinds.values()

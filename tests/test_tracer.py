@@ -21,6 +21,13 @@ def method(request):
     return request.param
 
 
+def test_the_default_is_dual(rng):
+    scene, rays = triangle_soup(rng, 100), random_rays(rng, 100)
+    for tracer in (rs.Tracer(scene), rs.Tracer(scene, "auto", builder="quality")):
+        assert tracer.method == "dual"
+        assert_same_hits(tracer.intersect(*rays), rs.Tracer(scene, "brute").intersect(*rays))
+
+
 def test_methods_are_listed():
     assert METHODS == ["brute", "rsh", "crsh", "ldc", "packet", "dual"]
 
@@ -143,12 +150,12 @@ def test_strings_are_refused():
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"method": "bvh"}, "'brute', 'rsh', 'crsh', 'ldc', 'packet', 'dual', got 'bvh'"),
+    ({"method": "bvh"}, "'brute', 'rsh', 'crsh', 'ldc', 'packet', 'dual', 'auto', got 'bvh'"),
     ({"method": "rsh", "speed": 3}, "no option 'speed'; its options: arity, levels, reduction"),
     ({"method": "brute", "arity": 4}, "no option 'arity'; its options: none"),
-    ({"arity": 5}, "arity: need one of 4, 8, got 5"),
-    ({"levels": -1}, "levels: need a whole number"),
-    ({"reduction": "sorted"}, "reduction: need one of 'fused'"),
+    ({"method": "crsh", "arity": 5}, "arity: need one of 4, 8, got 5"),
+    ({"method": "crsh", "levels": -1}, "levels: need a whole number"),
+    ({"method": "crsh", "reduction": "sorted"}, "reduction: need one of 'fused'"),
     ({"memory_limit": 0}, "memory_limit"),
 ])  # fmt: skip
 def test_bad_options_are_refused(options, message):
