@@ -30,9 +30,9 @@ _METHODS = {
     "dual": DualTracer,
 }
 AUTO = "auto"
-# Frames of 512 x 512 with two bounces and shadows take a third of the time of `crsh` (four scenes
-# of 24,000 to 87,000 triangles). `packet` takes as long or less where nothing moves, but needs 56 ms
-# to build its hierarchy over 69,451 triangles anew, `dual` 2 to 6.
+# Frames of 512 x 512 with two bounces and shadows take a third of the time of `crsh` (four
+# scenes of 24,000 to 87,000 triangles). `packet` takes as long or less where nothing moves, but
+# needs 56 ms to build its hierarchy over 69,451 triangles anew, `dual` 2 to 6.
 _AUTO_METHOD = "dual"
 _COMMON = ("self", "session", "geometry", "memory_limit")
 # The default memory_limit: a part of the device's memory, and no more than needed to be fast.

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from raystream.baselines import BruteForceTracer, EmbreeTracer
 from raystream.baselines.tolerance import differing, differing_occlusion
-from soup import exact_tracer, random_rays, triangle_soup
+from soup import assert_same_hits, exact_tracer, random_rays, triangle_soup
 
 import raystream as rs
 
