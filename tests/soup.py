@@ -1,6 +1,7 @@
 """Random triangles and rays, for many tests."""
 
 import numpy as np
+from hypothesis import strategies as st
 
 import raystream as rs
 from raystream import device, rays
@@ -35,6 +36,59 @@ def random_rays(rng, count, spread=1.0):
     origins = (rng.random((count, 3)) * (1 + 2 * spread) - spread).astype(np.float32)
     directions = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-3, 3, (count, 1))
     return origins, directions.astype(np.float32)
+
+
+@st.composite
+def awkward_queries(draw):
+    """Scenes of 97 degenerate, huge, tiny or far triangles, and 160 rays at their rims.
+
+    Draws a scene, and origins, directions, tnear and tfar.
+    """
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    size = draw(st.sampled_from([1e-4, 0.05, 1.0, 30.0]))
+    shape = draw(st.sampled_from(["any", "flat", "sliver", "point", "line"]))
+    places = [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 100.0), (1e-3, 100.0)]
+    scale, offset = draw(st.sampled_from(places))
+    away = draw(st.sampled_from([0.0, 1.0, 30.0, 3e3, 1e5, 1e7]))
+    corners = (scale * _awkward_corners(rng, size, shape) + offset).astype(np.float32)
+    scene = rs.Scene([mesh_of("a", corners[:40]), mesh_of("b", corners[40:])])
+    return scene, _rays_at_rims(rng, corners, scale, offset, away)
+
+
+def _awkward_corners(rng, size, shape):
+    corners = rng.random((97, 1, 3)) + size * (rng.random((97, 3, 3)) - 0.5)
+    if shape == "flat":  # parallel to the axes, on lines of a grid and in front of each other
+        corners = np.round(8 * corners) / 8
+        corners[np.arange(97), :, rng.integers(0, 3, 97)] = rng.integers(0, 3, (97, 1)) / 2
+    elif shape == "sliver":
+        corners[:, 2] = corners[:, 0] + 1e-4 * rng.normal(size=(97, 3)) * size
+    elif shape == "point":
+        corners[::2] = corners[::2, :1]
+    elif shape == "line":
+        corners[::2, 2] = (corners[::2, 0] + corners[::2, 1]) / 2
+    return corners
+
+
+def _rays_at_rims(rng, corners, scale, offset, away):
+    """At vertices, points of edges and of triangles, some of them along axes."""
+    weights = rng.dirichlet([0.5, 0.5, 0.5], 160)
+    weights[::3] = np.eye(3)[rng.integers(0, 3, len(weights[::3]))]  # at vertices
+    weights[1::3, 0] = 0  # about edges
+    aim = np.einsum("ij,ijk->ik", weights, corners[rng.integers(0, 97, 160)].astype(np.float64))
+    origins = 0.5 + (0.3 + away) * rng.normal(size=(160, 3))
+    origins = (scale * origins + offset).astype(np.float32)
+    directions = (aim - origins).astype(np.float32)
+    straight = rng.random(160) < 0.4  # along an axis, or in a plane of two
+    along = np.eye(3)[rng.integers(0, 3, 160)] * rng.choice([-1, 1], (160, 1))
+    along[::5] += np.roll(along[::5], 1, axis=1)
+    origins[straight] = aim[straight]
+    origins -= np.where(straight[:, None], along * away * scale, 0).astype(np.float32)
+    directions = np.where(straight[:, None], along, directions)
+    directions[~directions.any(axis=1)] = 1
+    directions = (directions * 10.0 ** rng.uniform(-3, 3, (160, 1))).astype(np.float32)
+    tnear = np.where(rng.random(160) < 0.7, 0, rng.random(160)).astype(np.float32)
+    tfar = np.where(rng.random(160) < 0.5, np.inf, 2 * rng.random(160)).astype(np.float32)
+    return origins, directions, tnear, tfar
 
 
 def exact_tracer(scene, method):
