@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from raystream.checks import check_choice
+from raystream.errors import MemoryLimitError
 from raystream.hash import DEFAULT_HASH
 from raystream.intersect import HitStream, not_blocked
 from raystream.order import leaf_slots, sorted_slots
@@ -67,7 +68,8 @@ class DualTracer:
         Bytes that the scene hierarchy may take.
     builder : {"auto", "fast", "quality"}
         See `raystream.tree.SceneTree`. "auto" takes "fast", and "quality" once the rays traced
-        since the geometry changed outnumber the triangles three times.
+        since the geometry changed outnumber the triangles three times, where `memory_limit` allows
+        a second hierarchy.
     traversal : {"auto", "single", "bundle", "stream"}
         How rays walk the hierarchy. "auto" measures which is the fastest for the rays of each call.
 
@@ -92,24 +94,37 @@ class DualTracer:
         self.session, self.geometry, self._memory_limit = session, geometry, memory_limit
         self._builder, self._traversal = builder, traversal
         self._trees, self._built, self._version, self._num_traced = {}, None, None, 0
+        self._quality_fits = True
 
     def tree(self, num_rays=0):
         """The `SceneTree` of the geometry as it is now, for so many rays to come."""
         if self._version != self.geometry.version:
             self._built, self._version, self._num_traced = None, self.geometry.version, 0
         self._num_traced += num_rays
-        builder = self._builder
-        if builder == "auto":
-            many = self._num_traced >= _RAYS_OF_QUALITY * self.geometry.num_triangles
-            builder = "quality" if many or self._built == "quality" else "fast"
+        builder = self._chosen_builder() if self._builder == "auto" else self._builder
         if builder not in self._trees:
-            self._trees[builder] = SceneTree(
-                self.session, self.geometry, builder, self._memory_limit
-            )
+            self._add_tree(builder)
         if builder != self._built:
             self._trees[builder].build()
             self._built = builder
         return self._trees[builder]
+
+    def _chosen_builder(self):
+        many = self._num_traced >= _RAYS_OF_QUALITY * self.geometry.num_triangles
+        if not (self._quality_fits and (many or self._built == "quality")):
+            return "fast"
+        if "quality" not in self._trees:
+            try:
+                self._add_tree("quality")
+            except MemoryLimitError:
+                self._quality_fits = False
+                return "fast"
+        return "quality"
+
+    def _add_tree(self, builder):
+        taken = sum(tree.structure_bytes for tree in self._trees.values())
+        limit = self._memory_limit - taken
+        self._trees[builder] = SceneTree(self.session, self.geometry, builder, limit)
 
     def intersect(self, rays):
         """Closest hits of `rays`; returns (HitStream, Statistics)."""

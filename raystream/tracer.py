@@ -35,9 +35,10 @@ AUTO = "auto"
 # needs 56 ms to build its hierarchy over 69,451 triangles anew, `dual` 2 to 6.
 _AUTO_METHOD = "dual"
 _COMMON = ("self", "session", "geometry", "memory_limit")
-# The default memory_limit: a part of the device's memory, and no more than needed to be fast.
+# The default memory_limit: a part of the device's memory, and for streams of candidates, which
+# are cut into batches, no more than needed to be fast.
 _MEMORY_SHARE = 4
-_MOST_MEMORY = 1 << 30
+_STREAM_METHODS, _MOST_STREAM_MEMORY = ("rsh", "crsh"), 1 << 30
 
 
 def methods():
@@ -79,8 +80,8 @@ class Tracer:
     device : pyopencl.Device, optional
         Default: ``$PYOPENCL_CTX`` if set, else the first GPU, else the CPU.
     memory_limit : int, optional
-        Bytes that the candidates of one call may take; default: 1 GiB, or a quarter of the device's
-        memory where that is less.
+        Bytes that the candidates of one call, or what a method builds of the scene, may take;
+        default: a quarter of the device's memory; of candidates, at most 1 GiB.
     **options
         Of the method: see `raystream.rsh.RayspaceTracer`, `raystream.crsh.CoherentTracer`,
         `raystream.ldc.LayeredDepthCubeTracer`, `raystream.packet.PacketTracer`,
@@ -217,15 +218,18 @@ class Tracer:
         backend = backends.get(self)
         if backend is None:
             geometry = Geometry(session, self.scene)
-            limit = self._memory_limit or min(
-                session.device.global_mem_size // _MEMORY_SHARE, _MOST_MEMORY
-            )
+            limit = self._memory_limit or _default_limit(self.method, session.device)
             method = _METHODS[self.method](session, geometry, limit, **self._options)
             backend = backends[self] = _Backend(geometry, method, version=0)
         if backend.version != self._version:
             backend.geometry.update(self._vertices)
             backend.version = self._version
         return backend
+
+
+def _default_limit(method, device):
+    share = device.global_mem_size // _MEMORY_SHARE
+    return min(share, _MOST_STREAM_MEMORY) if method in _STREAM_METHODS else share
 
 
 @dataclasses.dataclass

@@ -18,6 +18,7 @@ from soup import (
 
 import raystream as rs
 from raystream import device, program
+from raystream.errors import MemoryLimitError
 from raystream.rays import from_camera, from_numpy
 from raystream.statistics import HIERARCHY_CREATION, TRAVERSAL
 
@@ -217,6 +218,22 @@ def test_moving_vertices(rng, traversal):
         dual.update_vertices(vertices)
         brute.update_vertices(vertices)
         assert_same_hits(dual.intersect(*rays), brute.intersect(*rays))
+
+
+def test_the_better_builder_is_left_where_it_does_not_fit(rng, session):
+    scene, rays = triangle_soup(rng, 1000), random_rays(rng, 10000)
+    bytes_of = {}
+    for builder in ("fast", "quality"):
+        tracer = rs.Tracer(scene, "dual", builder=builder)
+        tracer.intersect(*rays)
+        bytes_of[builder] = tracer.statistics.structure_bytes
+    for limit, built in ((sum(bytes_of.values()), "quality"), (bytes_of["quality"] - 1, "fast")):
+        tracer = rs.Tracer(scene, "dual", memory_limit=limit)
+        for _ in range(2):
+            tracer.intersect(*rays)
+        assert tracer.statistics.structure_bytes == bytes_of[built]
+    with pytest.raises(MemoryLimitError, match="1000 triangles need"):
+        rs.Tracer(scene, "dual", memory_limit=bytes_of["fast"] - 1).intersect(*rays)
 
 
 def test_a_tree_is_made_once_a_frame_and_takes_no_new_memory(rng, session):
