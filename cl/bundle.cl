@@ -42,8 +42,6 @@ typedef struct {
     bool any;   // one hit is enough
 } Bundle;
 
-inline float highest(float16 v) { return -lowest(-v); }
-
 // cl/triangle.h: ray_frame, lane by lane.
 inline RayFrame16 frame_of(const Rays16 *r)
 {
@@ -400,10 +398,7 @@ inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, b
 }
 
 #define DEFINE_BUNDLE(NAME, ANY, RESULT, STORE)                                                    \
-    kernel void NAME(const uint num_slots, const uint stride, global const uint *restrict slots,   \
-                     global const float4 *restrict org_tnear,                                      \
-                     global const float4 *restrict dir_tfar, global const float8 *restrict nodes,  \
-                     global const float8 *restrict leaves, global ulong *restrict counts, RESULT)  \
+    kernel void NAME(TRAVERSAL_ARGUMENTS, RESULT)                                                  \
     {                                                                                              \
         const uint first = get_global_id(0) * stride * RAYS;                                       \
         const Tree tree = {nodes, leaves};                                                         \

@@ -28,12 +28,21 @@ inline float16 magnitude(float16 x) { return as_float16(as_int16(x) & 0x7fffffff
 
 inline float16 larger(float16 a, float16 b) { return a > b ? a : b; }
 
-inline float lowest(float16 v)
+inline float size_of(float v) { return v < 0.0f ? -v : v; }
+
+inline float4 size_of4(float4 v) { return v < 0.0f ? -v : v; }
+
+inline float lowest8(float8 v)
 {
-    const float8 a = v.lo < v.hi ? v.lo : v.hi;
-    const float4 b = a.lo < a.hi ? a.lo : a.hi;
-    return MIN(MIN(b.x, b.y), MIN(b.z, b.w));
+    const float4 a = v.lo < v.hi ? v.lo : v.hi;
+    return MIN(MIN(a.x, a.y), MIN(a.z, a.w));
 }
+
+inline float lowest(float16 v) { return lowest8(v.lo < v.hi ? v.lo : v.hi); }
+
+inline float highest8(float8 v) { return -lowest8(-v); }
+
+inline float highest(float16 v) { return -lowest(-v); }
 
 #ifdef CHUNKS
 // First element of a chunk, where CHUNKS of them share a stream of n elements.
@@ -42,4 +51,16 @@ inline ulong chunk_first(ulong chunk, ulong n) { return chunk * n / CHUNKS; }
 // Chunk of this work-item: first, and last + 1.
 inline ulong chunk_begin(ulong n) { return chunk_first(get_global_id(0), n); }
 inline ulong chunk_end(ulong n) { return chunk_first(get_global_id(0) + 1, n); }
+
+// The box around those of all chunks, each a low and a high corner.
+inline void enclose_chunks(global const float4 *boxes, float4 *low, float4 *high)
+{
+    *low = INFINITY;
+    *high = -INFINITY;
+    for (uint chunk = 0; chunk < CHUNKS; chunk++) {
+        const float4 a = boxes[2 * chunk], b = boxes[2 * chunk + 1];
+        *low = a < *low ? a : *low;
+        *high = b > *high ? b : *high;
+    }
+}
 #endif

@@ -39,12 +39,8 @@ kernel void measure_box(const uint num_triangles, global const float4 *restrict 
 kernel void make_grid(const uint resolution, global const float4 *restrict boxes,
                       global float4 *restrict grid)
 {
-    float4 low = INFINITY, high = -INFINITY;
-    for (uint c = 0; c < CHUNKS; c++) {
-        const float4 a = boxes[2 * c], b = boxes[2 * c + 1];
-        low = a < low ? a : low;
-        high = b > high ? b : high;
-    }
+    float4 low, high;
+    enclose_chunks(boxes, &low, &high);
     const float4 extent = high - low;
     float edge = MAX(extent.x, MAX(extent.y, extent.z));
     edge = edge > SMALLEST_BOX ? edge : SMALLEST_BOX;

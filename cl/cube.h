@@ -111,10 +111,6 @@ inline float4 seen_along(uint axis, float4 v)
     return axis == 0 ? v.yzxw : axis == 1 ? v.zxyw : v;
 }
 
-inline float size_of(float v) { return v < 0.0f ? -v : v; }
-
-inline float4 size_of4(float4 v) { return v < 0.0f ? -v : v; }
-
 inline int floor_of(float v)
 {
     const int whole = (int)v;

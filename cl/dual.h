@@ -32,23 +32,15 @@ typedef struct {
     uint unused;      // a cache line
 } BoxRay;
 
-inline float lowest8(float8 v)
-{
-    const float4 a = v.lo < v.hi ? v.lo : v.hi;
-    return MIN(MIN(a.x, a.y), MIN(a.z, a.w));
-}
-
 inline Box scene_box(global const float8 *root)
 {
     Box b;
     for (uint k = 0; k < 3; k++) {
         b.low[k] = lowest8(root[k]);
-        b.high[k] = -lowest8(-root[3 + k]);
+        b.high[k] = highest8(root[3 + k]);
     }
     return b;
 }
-
-inline float size_of(float x) { return x < 0.0f ? -x : x; }
 
 inline BoxRay box_ray(const Box *scene, float4 org_tnear, float4 dir_tfar)
 {

@@ -30,15 +30,13 @@ typedef struct {
     float pad;
 } Frustum;
 
-inline float4 magnitude4(float4 v) { return v < 0.0f ? -v : v; }
 inline float4 smaller4(float4 a, float4 b) { return a < b ? a : b; }
 inline float4 larger4(float4 a, float4 b) { return a > b ? a : b; }
-inline float magnitude1(float v) { return v < 0.0f ? -v : v; }
 
 // The largest coordinate of a box.
 inline float box_size(float4 low, float4 high)
 {
-    const float4 m = larger4(magnitude4(low), magnitude4(high));
+    const float4 m = larger4(size_of4(low), size_of4(high));
     return MAX(MAX(m.x, m.y), m.z);
 }
 
@@ -55,9 +53,9 @@ typedef struct {
 inline Axes dominant_axes(const float *direction)
 {
     Axes a = {1, 2, 0, 1.0f};
-    if (magnitude1(direction[1]) > magnitude1(direction[0]))
+    if (size_of(direction[1]) > size_of(direction[0]))
         a.k = 1, a.u = 2, a.v = 0;
-    if (magnitude1(direction[2]) > magnitude1(direction[a.k]))
+    if (size_of(direction[2]) > size_of(direction[a.k]))
         a.k = 2, a.u = 0, a.v = 1;
     a.sign = direction[a.k] < 0.0f ? -1.0f : 1.0f;
     return a;
@@ -100,7 +98,7 @@ inline void set_near_far(Frustum *f, Axes a, float near, float far, float4 at_ne
     f->normal[a.u] = (float4)(-1.0f, 0.0f, 1.0f, 0.0f);
     f->normal[a.v] = (float4)(0.0f, -1.0f, 0.0f, 1.0f);
     f->normal[a.k] = -outward * slope * a.sign;
-    f->offset = outward * (at_near - slope * near) + f->pad * (1.0f + magnitude4(slope));
+    f->offset = outward * (at_near - slope * near) + f->pad * (1.0f + size_of4(slope));
     f->org[a.u] = at_near.xzzx, f->org[a.v] = at_near.yyww, f->org[a.k] = near * a.sign;
     f->dir[a.u] = at_far.xzzx - at_near.xzzx, f->dir[a.v] = at_far.yyww - at_near.yyww;
     f->dir[a.k] = (far - near) * a.sign;
@@ -130,8 +128,8 @@ inline bool set_corner_rays(Frustum *f, const SimdRay *rays, uint count, uint si
     if (left != 15 && right != 15)
         return false;
     const float4 nu = left ? dv : -dv, nv = left ? -du : du;
-    const float4 width = magnitude4(nu) + magnitude4(nv);
-    const float4 margin = -SLACK * width * (1.0f + (magnitude4(u) + magnitude4(v)));
+    const float4 width = size_of4(nu) + size_of4(nv);
+    const float4 margin = -SLACK * width * (1.0f + (size_of4(u) + size_of4(v)));
     const float nus[4] = {nu.x, nu.y, nu.z, nu.w}, nvs[4] = {nv.x, nv.y, nv.z, nv.w};
     const float us[4] = {u.x, u.y, u.z, u.w}, vs[4] = {v.x, v.y, v.z, v.w};
     const float margins[4] = {margin.x, margin.y, margin.z, margin.w};
@@ -151,7 +149,7 @@ inline bool set_corner_rays(Frustum *f, const SimdRay *rays, uint count, uint si
     const float4 nk = -(nu * u + nv * v);
     f->normal[a.u] = nu, f->normal[a.v] = nv, f->normal[a.k] = nk * a.sign;
     f->offset = nu * origin[a.u] + nv * origin[a.v] + nk * (origin[a.k] * a.sign)
-                + f->pad * (width + magnitude4(nk));
+                + f->pad * (width + size_of4(nk));
     f->dir[a.u] = u, f->dir[a.v] = v, f->dir[a.k] = a.sign;
     for (uint axis = 0; axis < 3; axis++)
         f->org[axis] = origin[axis];
@@ -176,7 +174,7 @@ inline void bound_packet(Frustum *f, const SimdRay *rays, uint count, const floa
             high = (live_lanes(rays + i) & (o > high)) ? o : high;
         }
         const float first = least_lane(low), last = most_lane(high);
-        size = MAX(size, MAX(magnitude1(first), magnitude1(last)));
+        size = MAX(size, MAX(size_of(first), size_of(last)));
         shared &= first == last;
         if (axis == a.k)
             near = a.sign > 0.0f ? first : -last;
@@ -192,11 +190,11 @@ inline void bound_packet(Frustum *f, const SimdRay *rays, uint count, const floa
     f->valid = true;
     f->pad = PAD * size;
     if (!(shared && side && set_corner_rays(f, rays, count, side, a))) {
-        const float4 ends = larger4(magnitude4(at_near), magnitude4(at_far));
+        const float4 ends = larger4(size_of4(at_near), size_of4(at_far));
         f->pad = PAD * MAX(MAX(size, MAX(ends.x, ends.y)), MAX(ends.z, ends.w));
         set_near_far(f, a, near, far, at_near, at_far);
     }
-    f->length = magnitude4(f->dir[0]) + magnitude4(f->dir[1]) + magnitude4(f->dir[2]);
+    f->length = size_of4(f->dir[0]) + size_of4(f->dir[1]) + size_of4(f->dir[2]);
     for (uint axis = 0; axis < 3; axis++)
         f->steady[axis] = MASK4(f->dir[axis] > 0.0f) == 15
                               ? 1.0f
@@ -224,7 +222,7 @@ inline bool rays_cull_box(const Frustum *f, float4 low, float4 high)
             // leave_a / d_a < enter_b / d_b, times d_a d_b
             const float4 left = leave[a] * f->dir[b], right = enter[b] * f->dir[a];
             const float4 before = f->steady[a] * f->steady[b] * (right - left);
-            if (MASK4(before > SLACK * (magnitude4(left) + magnitude4(right))) == 15)
+            if (MASK4(before > SLACK * (size_of4(left) + size_of4(right))) == 15)
                 return true;
         }
     return false;
@@ -239,14 +237,14 @@ inline bool frustum_culls_box(const Frustum *f, float4 low, float4 high)
     return MASK4(x + y + z > f->offset) || rays_cull_box(f, low, high);
 }
 
-inline float size_of(float4 v) { return magnitude1(v.x) + magnitude1(v.y) + magnitude1(v.z); }
+inline float sum_of_sizes(float4 v) { return size_of(v.x) + size_of(v.y) + size_of(v.z); }
 
 inline bool rays_cull_triangle(const Frustum *f, const float4 *v)
 {
     const float4 e[3] = {v[1] - v[0], v[2] - v[1], v[0] - v[2]};
     const float4 n = cross3(e[0], e[1]);
     const float4 facing = f->dir[0] * n.x + f->dir[1] * n.y + f->dir[2] * n.z;
-    const float4 slack = SLACK * (size_of(e[0]) * size_of(e[1])) * f->length;
+    const float4 slack = SLACK * (sum_of_sizes(e[0]) * sum_of_sizes(e[1])) * f->length;
     const bool front = MASK4(facing > slack) == 15, back = MASK4(facing < -slack) == 15;
     if (!front && !back)
         return false;
@@ -255,7 +253,7 @@ inline bool rays_cull_triangle(const Frustum *f, const float4 *v)
         const float4 side = f->dir[0] * (y * e[k].z - z * e[k].y)
                             + f->dir[1] * (z * e[k].x - x * e[k].z)
                             + f->dir[2] * (x * e[k].y - y * e[k].x);
-        const float4 margin = f->pad * size_of(e[k]) * f->length;
+        const float4 margin = f->pad * sum_of_sizes(e[k]) * f->length;
         if (MASK4((front ? side : -side) < -margin) == 15)
             return true;
     }

@@ -103,13 +103,6 @@ inline Boxes bound_vertices(global const float16 *rows, uint count)
     return boxes;
 }
 
-inline float highest(float16 v)
-{
-    const float8 a = v.lo > v.hi ? v.lo : v.hi;
-    const float4 b = a.lo > a.hi ? a.lo : a.hi;
-    return MAX(MAX(b.x, b.y), MAX(b.z, b.w));
-}
-
 // The box around all sixteen: its low corner to corners[0], its high corner to corners[1].
 inline void store_box(global float4 *corners, Boxes b)
 {
@@ -392,11 +385,8 @@ kernel void make_keys(const uint num_blocks, const float oversize,
                       global const float16 *restrict bound_rows,
                       global const float4 *restrict boxes, global uint16 *restrict keys)
 {
-    float4 low = INFINITY, high = -INFINITY;
-    for (uint chunk = 0; chunk < CHUNKS; chunk++) {
-        low = boxes[2 * chunk] < low ? boxes[2 * chunk] : low;
-        high = boxes[2 * chunk + 1] > high ? boxes[2 * chunk + 1] : high;
-    }
+    float4 low, high;
+    enclose_chunks(boxes, &low, &high);
     const float4 size = high - low;
     const float largest = MAX(size.x, MAX(size.y, size.z));
     const float cells = (1 << CELL_BITS) / largest, limit = oversize * largest;

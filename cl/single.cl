@@ -10,10 +10,7 @@
 #include "single.h"
 
 #define DEFINE_SINGLE(NAME, ANY, RESULT, STORE)                                                    \
-    kernel void NAME(const uint num_slots, const uint stride, global const uint *restrict slots,   \
-                     global const float4 *restrict org_tnear,                                      \
-                     global const float4 *restrict dir_tfar, global const float8 *restrict nodes,  \
-                     global const float8 *restrict leaves, global ulong *restrict counts, RESULT)  \
+    kernel void NAME(TRAVERSAL_ARGUMENTS, RESULT)                                                  \
     {                                                                                              \
         const uint first = get_global_id(0) * stride * RAYS;                                       \
         const uint stop = MIN(first + RAYS, num_slots);                                            \
@@ -21,10 +18,8 @@
         const Box scene = scene_box(nodes);                                                        \
         Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
         for (uint i = first; i < stop; i++) {                                                      \
-            const uint ray = slots[i], soon = slots[MIN(i + AHEAD, num_slots - 1)];                \
-            PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));                                    \
-            PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));                                     \
-            if (ray == INVALID || !(dir_tfar[ray].w >= org_tnear[ray].w))                          \
+            const uint ray = active_ray(slots, num_slots, i, org_tnear, dir_tfar);                 \
+            if (ray == INVALID)                                                                    \
                 continue;                                                                          \
             SingleRay r = single_ray(&scene, org_tnear[ray], dir_tfar[ray]);                       \
             walk(&r, &tree, 0, ANY, &c);                                                           \

@@ -39,6 +39,23 @@ inline void store_counts(const Counts *c, global ulong *counts)
     counts[8] = c->hits;
 }
 
+// What every traversal takes, before its results.
+#define TRAVERSAL_ARGUMENTS                                                                        \
+    const uint num_slots, const uint stride, global const uint *restrict slots,                    \
+        global const float4 *restrict org_tnear, global const float4 *restrict dir_tfar,           \
+        global const float8 *restrict nodes, global const float8 *restrict leaves,                 \
+        global ulong *restrict counts
+
+// The ray in a slot; INVALID where there is none, or none that can hit.
+inline uint active_ray(global const uint *slots, uint num_slots, uint i,
+                       global const float4 *org_tnear, global const float4 *dir_tfar)
+{
+    const uint ray = slots[i], soon = slots[MIN(i + AHEAD, num_slots - 1)];
+    PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));
+    PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));
+    return ray != INVALID && dir_tfar[ray].w >= org_tnear[ray].w ? ray : INVALID;
+}
+
 // Of the rays that hit; the arrays hold misses before.
 #define HITS_ARGUMENTS                                                                             \
     global float *restrict hit_t, global uint *restrict hit_triangle, global float *restrict hit_u,\

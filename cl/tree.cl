@@ -65,11 +65,8 @@ kernel void place_triangles(const uint num_triangles, global const float4 *restr
                             global const float4 *restrict boxes, global uint16 *restrict keys)
 {
     const uint num_blocks = (num_triangles + 15) / 16;
-    float4 low = INFINITY, high = -INFINITY;
-    for (uint chunk = 0; chunk < CHUNKS; chunk++) {
-        low = boxes[2 * chunk] < low ? boxes[2 * chunk] : low;
-        high = boxes[2 * chunk + 1] > high ? boxes[2 * chunk + 1] : high;
-    }
+    float4 low, high;
+    enclose_chunks(boxes, &low, &high);
     const float4 size = high - low;
     const float largest = MAX(size.x, MAX(size.y, size.z));
     const float cells = (1 << CELL_BITS) / largest;

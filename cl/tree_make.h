@@ -25,18 +25,6 @@ inline Boxes bound_corners(const float16 corners[3][3], int16 meant)
     return b;
 }
 
-inline float lowest8(float8 v)
-{
-    const float4 a = v.lo < v.hi ? v.lo : v.hi;
-    return MIN(MIN(a.x, a.y), MIN(a.z, a.w));
-}
-
-inline float highest8(float8 v)
-{
-    const float4 a = v.lo > v.hi ? v.lo : v.hi;
-    return MAX(MAX(a.x, a.y), MAX(a.z, a.w));
-}
-
 // Corners of sixteen triangles, by corner and axis.
 inline void gather_corners(global const float4 *triangles, const uint *numbers,
                            float16 corners[3][3])

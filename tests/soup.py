@@ -96,6 +96,18 @@ def exact_tracer(scene, method):
     return rs.Tracer(scene, method, **({"exact": True} if method == "ldc" else {}))
 
 
+def tripled(scene):
+    """Every triangle three times, in another order of meshes: all distances are equal ones."""
+    return rs.Scene([*scene.meshes, *scene.meshes[::-1], *scene.meshes])
+
+
+def rays_from_afar(rng, scene, count=200):
+    """At vertices, from up to 1e9 away; directions of a length from 1e-20 to 1e17."""
+    aim = scene.vertices[rng.integers(0, len(scene.vertices), count)]
+    away = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-2, 9, (count, 1))
+    return aim + away, -away * 10.0 ** rng.uniform(-20, 8, (count, 1))
+
+
 def grid_of_rays(width, height):
     """Camera rays of a screen that looks at the unit cube, on the device."""
     camera = rs.Camera.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.5), fov_y=30.0)

@@ -13,7 +13,9 @@ from soup import (
     grid_of_rays,
     mesh_of,
     random_rays,
+    rays_from_afar,
     triangle_soup,
+    tripled,
 )
 
 import raystream as rs
@@ -127,18 +129,13 @@ def test_a_flat_scene(rng):
 
 
 def test_equal_distances_go_to_the_smaller_triangle(rng):
-    """Every triangle three times, in another order of meshes."""
-    meshes = triangle_soup(rng, 200).meshes
-    scene = rs.Scene([*meshes, *meshes[::-1], *meshes])
+    scene = tripled(triangle_soup(rng, 200))
     assert_exact(scene, *random_rays(rng, 2000, spread=0.2))
 
 
 def test_rays_from_afar_and_of_extreme_length(rng):
     scene = triangle_soup(rng, 200)
-    aim = scene.vertices[rng.integers(0, len(scene.vertices), 200)]
-    away = rng.normal(size=(200, 3)) * 10.0 ** rng.uniform(-2, 9, (200, 1))
-    directions = -away * 10.0 ** rng.uniform(-20, 8, (200, 1))
-    assert_exact(scene, aim + away, directions)
+    assert_exact(scene, *rays_from_afar(rng, scene))
 
 
 @every_traversal

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_scenes import BUNNY, PATIO
-from soup import assert_same_hits, awkward_queries, box, random_rays, triangle_soup
+from soup import (
+    assert_same_hits,
+    awkward_queries,
+    box,
+    random_rays,
+    rays_from_afar,
+    triangle_soup,
+    tripled,
+)
 
 import raystream as rs
 from raystream import device, program, scenes
@@ -64,18 +72,13 @@ def test_rays_along_the_lines_of_the_grid():
 
 
 def test_equal_distances_go_to_the_smaller_triangle(rng):
-    """Every triangle three times, in another order of meshes."""
-    meshes = triangle_soup(rng, 200).meshes
-    scene = rs.Scene([*meshes, *meshes[::-1], *meshes])
+    scene = tripled(triangle_soup(rng, 200))
     assert_exact(scene, *random_rays(rng, 2000, spread=0.2))
 
 
 def test_rays_from_afar_and_of_extreme_length(rng):
     scene = triangle_soup(rng, 200)
-    aim = scene.vertices[rng.integers(0, len(scene.vertices), 200)]
-    away = rng.normal(size=(200, 3)) * 10.0 ** rng.uniform(-2, 9, (200, 1))
-    directions = -away * 10.0 ** rng.uniform(-20, 8, (200, 1))
-    assert_exact(scene, aim + away, directions)
+    assert_exact(scene, *rays_from_afar(rng, scene))
 
 
 @pytest.mark.parametrize("exact", [False, True])
