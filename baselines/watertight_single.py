@@ -44,12 +44,10 @@ def intersect_pairs(origins, directions, corners, tnear, tfar):
         As in watertight.py; meaningless where `hit` is False.
     """
     with np.errstate(all="ignore"):  # infinities and NaN are misses
-        rows = _frames(directions)
-        relative = corners - origins[:, None]
-        x, y, z = (
-            fma(a, relative[..., 0], fma(b, relative[..., 1], c * relative[..., 2]))
-            for a, b, c in (row.T[..., None] for row in rows)
-        )
+        turn, shear_x, shear_y, scale = _frames(directions)
+        relative = np.take_along_axis(corners - origins[:, None], turn[:, None], axis=2)
+        x, y = (fma(s[:, None], relative[..., 2], relative[..., k]) for k, s in ((0, shear_x), (1, shear_y)))
+        z = scale[:, None] * relative[..., 2]
         edges = [_difference_of_products(x, y, (k + 2) % 3, (k + 1) % 3) for k in range(3)]
         inside = np.all([edge >= 0 for edge in edges], axis=0)
         inside |= np.all([edge <= 0 for edge in edges], axis=0)
@@ -61,18 +59,11 @@ def intersect_pairs(origins, directions, corners, tnear, tfar):
 
 
 def _frames(directions):
-    """Return the rows (3, n, 3) of the maps that take rays to the z axis."""
-    n = len(directions)
+    """Return the turn (n, 3), x's, y's shear and the scale of each ray's frame."""
     major = np.argmax(np.abs(directions), axis=1)  # of equal components the first
-    ray = np.arange(n)
-    along = directions[ray, major]
-    rows = np.zeros((3, n, 3), np.float32)
-    for row in (0, 1):
-        across = (major + 1 + row) % 3
-        rows[row, ray, across] = 1
-        rows[row, ray, major] = -(directions[ray, across] / along)
-    rows[2, ray, major] = np.float32(1) / along
-    return rows
+    turn = (major[:, None] + (1, 2, 0)) % 3
+    x, y, z = np.take_along_axis(directions, turn, axis=1).T
+    return turn, -(x / z), -(y / z), np.float32(1) / z
 
 
 def _difference_of_products(x, y, i, j):

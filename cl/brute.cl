@@ -3,25 +3,18 @@
 // One work-item takes 16 consecutive rays in the lanes of float16 and walks over all triangles in
 // order, so the first of equal distances, which has the smallest number, stays.
 
+#include "rays.h"
 #include "triangle.h"
 
 // Lanes past the last ray, and inactive rays, get tfar = -1 and so never hit.
 inline RayFrame16 ray_frame16(uint first, uint num_rays, global const float4 *org_tnear,
                               global const float4 *dir_tfar)
 {
-    float rows[14][16] __attribute__((aligned(64)));
-    for (uint lane = 0; lane < 16; lane++) {
-        const uint ray = first + lane < num_rays ? first + lane : num_rays - 1;
-        const RayFrame r = ray_frame(org_tnear[ray], dir_tfar[ray]);
-        const bool active = first + lane < num_rays && r.tfar >= r.tnear;
-        const float fields[14] = {r.ox, r.oy, r.oz, r.x0, r.y0, r.z0, r.x1, r.y1,
-                                  r.z1, r.x2, r.y2, r.z2, r.tnear, active ? r.tfar : -1.0f};
-        for (uint k = 0; k < 14; k++)
-            rows[k][lane] = fields[k];
-    }
-    const float16 *v = (const float16 *)rows;
-    const RayFrame16 frame
-        = {v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13]};
+    const Rays16 r = load_rays(first, num_rays, org_tnear, dir_tfar);
+    const float16 o[3] = {r.ox, r.oy, r.oz}, d[3] = {r.dx, r.dy, r.dz};
+    const int16 active = r.tfar >= r.tnear;
+    RayFrame16 frame;
+    set_frame16(&frame, o, d, r.tnear, active ? r.tfar : (float16)-1.0f, active);
     return frame;
 }
 
@@ -51,9 +44,9 @@ kernel void intersect_brute(const uint num_rays, const uint num_triangles,
     float16 best = INFINITY;
     int16 nearest = (int)INVALID;
     for (uint i = 0; i < num_triangles; i++) {
-        global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)i;
+        global const float *v = (global const float *)(triangles + TRIANGLE_FLOAT4S * (ulong)i);
         float16 edges[3], depths[3];
-        const int16 inside = inside_edges16(&frame, v[0], v[1], v[2], edges, depths);
+        const int16 inside = inside_edges_rays16(&frame, v, 4, 1, edges, depths);
         if (MASK16(inside)) {
             const TriangleHit16 h = finish_hit16(&frame, inside, edges, depths);
             count -= h.hit;
@@ -83,9 +76,9 @@ kernel void occlude_brute(const uint num_rays, const uint num_triangles,
 {
     BEGIN_BRUTE
     for (uint i = 0; i < num_triangles; i++) {
-        global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)i;
+        global const float *v = (global const float *)(triangles + TRIANGLE_FLOAT4S * (ulong)i);
         float16 edges[3], depths[3];
-        const int16 inside = inside_edges16(&frame, v[0], v[1], v[2], edges, depths);
+        const int16 inside = inside_edges_rays16(&frame, v, 4, 1, edges, depths);
         if (MASK16(inside))
             count -= finish_hit16(&frame, inside, edges, depths).hit;
     }

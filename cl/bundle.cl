@@ -42,31 +42,6 @@ typedef struct {
     bool any;   // one hit is enough
 } Bundle;
 
-// cl/triangle.h: ray_frame, lane by lane.
-inline RayFrame16 frame_of(const Rays16 *r)
-{
-    const float16 ax = magnitude(r->dx), ay = magnitude(r->dy), az = magnitude(r->dz);
-    const int16 x = (ax >= ay) & (ax >= az), y = ~x & (ay >= az), z = ~(x | y);
-    const float16 major = x ? r->dx : y ? r->dy : r->dz;
-    const float16 qx = -(r->dx / major), qy = -(r->dy / major), qz = -(r->dz / major);
-    const float16 inverse = 1.0f / major, zero = 0.0f, one = 1.0f;
-    const RayFrame16 f = {r->ox,
-                          r->oy,
-                          r->oz,
-                          x ? qy : z ? one : zero,
-                          x ? one : y ? qz : zero,
-                          y ? one : z ? qx : zero,
-                          x ? qz : y ? one : zero,
-                          y ? qx : z ? one : zero,
-                          x ? one : z ? qy : zero,
-                          x ? inverse : zero,
-                          y ? inverse : zero,
-                          z ? inverse : zero,
-                          r->tnear,
-                          r->tfar < MAXFLOAT ? r->tfar : (float16)MAXFLOAT};
-    return f;
-}
-
 // Sixteen rays, and bounds of the active ones.
 typedef struct {
     float low_org[3], high_org[3], low_inverse[3], high_inverse[3];
@@ -104,7 +79,7 @@ inline void set_group(Group *g, const Rays16 *r, const Box *scene, Bounds *bound
         widen(&bounds->low_org[k], &bounds->high_org[k], o[k], active);
         widen(&bounds->low_inverse[k], &bounds->high_inverse[k], g->inverse[k], active);
     }
-    g->frame = frame_of(r);
+    set_frame16(&g->frame, o, d, r->tnear, r->tfar, active);
     g->per_t = per_t;
     g->begin = r->tnear * per_t / OUTWARDS + 0.0f;
     g->end = CLOSE_END(g, g->frame.tfar);
@@ -194,11 +169,11 @@ inline SingleRay ray_of_lane(const Group *g, uint lane)
     r.box.begin = LANE(float, begin);
     r.box.end = LANE(float, end);
     r.box.per_t = LANE(float, per_t);
-    const RayFrame f = {LANE(float, frame.ox),    LANE(float, frame.oy),  LANE(float, frame.oz),
-                        LANE(float, frame.x0),    LANE(float, frame.y0),  LANE(float, frame.z0),
-                        LANE(float, frame.x1),    LANE(float, frame.y1),  LANE(float, frame.z1),
-                        LANE(float, frame.x2),    LANE(float, frame.y2),  LANE(float, frame.z2),
-                        LANE(float, frame.tnear), LANE(float, frame.tfar)};
+    const uint z = LANE(uint, frame.major);
+    const RayFrame f = {LANE(float, frame.ox),      LANE(float, frame.oy),      LANE(float, frame.oz),
+                        LANE(float, frame.shear_x), LANE(float, frame.shear_y), LANE(float, frame.scale),
+                        LANE(float, frame.tnear),   LANE(float, frame.tfar),
+                        z == 2 ? 0 : z + 1,         z == 0 ? 2 : z - 1,         z};
     r.frame = f;
     const uint triangle = LANE(uint, nearest);
     r.nearest = triangle == INVALID ? MISS : hit_key(f.tfar, triangle);
@@ -233,11 +208,8 @@ inline uint finish_alone(Group *g, uint mask, const Tree *tree, uint node, bool 
 // Sixteen rays, those in `mask`, and triangle k of a leaf; returns those that have a new hit.
 inline uint test_triangle(Group *g, uint mask, global const float *leaf, uint k, Counts *c)
 {
-    const float4 v0 = (float4)(leaf[k], leaf[8 + k], leaf[16 + k], 0.0f);
-    const float4 v1 = (float4)(leaf[24 + k], leaf[32 + k], leaf[40 + k], 0.0f);
-    const float4 v2 = (float4)(leaf[48 + k], leaf[56 + k], leaf[64 + k], 0.0f);
     float16 edges[3], depths[3];
-    const int16 inside = inside_edges16(&g->frame, v0, v1, v2, edges, depths);
+    const int16 inside = inside_edges_rays16(&g->frame, leaf + k, 24, 8, edges, depths);
     c->tests += COUNT16(mask);
     if ((MASK16(inside) & mask) == 0)
         return 0;

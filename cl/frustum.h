@@ -42,7 +42,7 @@ inline float box_size(float4 low, float4 high)
 
 inline float lane_of(const VF *v, uint lane) { return ((const float *)v)[lane]; }
 
-inline VI live_lanes(const SimdRay *r) { return r->tfar >= 0.0f; }
+inline VI live_lanes(const SimdRay *r) { return r->frame.tfar >= 0.0f; }
 
 // The axes u, v and k, the dominant one; k counts along the rays: with `sign`.
 typedef struct {

@@ -13,22 +13,25 @@ inline uint ray_of(uint slot, uint num_slots, global const uint *slots)
     return slot < num_slots ? slots[slot] : INVALID;
 }
 
-// The corners of the triangles of up to WIDTH pairs; the last pair fills up.
+// The triangles of up to WIDTH pairs, component k of corner c in rows[3 * c + k]; the last pair fills up.
 inline void gather_corners(global const Pair *pairs, uint count, global const float4 *triangles,
-                           Corner16 *corners)
+                           float16 *rows)
 {
     for (uint corner = 0; corner < 3; corner++) {
         float4 s[WIDTH] __attribute__((aligned(64)));
         for (uint k = 0; k < WIDTH; k++)
             s[k] = triangles[TRIANGLE_FLOAT4S * (ulong)pairs[k < count ? k : count - 1].y + corner];
         float16 unused;
-        TRANSPOSE16(s, corners[corner].x, corners[corner].y, corners[corner].z, unused);
+        TRANSPOSE16(s, rows[3 * corner], rows[3 * corner + 1], rows[3 * corner + 2], unused);
     }
 }
 
 // One ray and up to WIDTH triangles: bit k of the result says whether triangle k is hit at t[k].
-inline uint intersect_run(const RayFrame *frame, const Corner16 *corners, uint count, float16 *t)
+inline uint intersect_run(const RayFrame *frame, const float16 *rows, uint count, float16 *t)
 {
+    Corner16 corners[3];
+    for (uint c = 0; c < 3; c++, rows += 3)
+        corners[c].x = rows[frame->x], corners[c].y = rows[frame->y], corners[c].z = rows[frame->z];
     float16 edges[3], depths[3];
     const int16 inside
         = inside_edges_run(frame, corners[0], corners[1], corners[2], edges, depths);
@@ -70,15 +73,15 @@ inline ulong nearest_key(global const Pair *pairs, uint mask, float16 distances)
         for (uint i = chunk_begin(n), end = chunk_end(n); i < end;) {                              \
             const uint first_slot = pairs[i].x * rays_per_node;                                    \
             const uint count = run_length(pairs, i, MIN(i + WIDTH, end));                          \
-            Corner16 corners[3];                                                                   \
-            gather_corners(pairs + i, count, triangles, corners);                                  \
+            float16 rows[9];                                                                       \
+            gather_corners(pairs + i, count, triangles, rows);                                     \
             for (uint k = 0; k < rays_per_node; k++) {                                             \
                 const uint ray = ray_of(first_slot + k, num_slots, slots);                         \
                 if (ray == INVALID || dir_tfar[ray].w < org_tnear[ray].w)                          \
                     continue;                                                                      \
                 const RayFrame frame = ray_frame(org_tnear[ray], dir_tfar[ray]);                   \
                 float16 t;                                                                         \
-                const uint mask = intersect_run(&frame, corners, count, &t);                       \
+                const uint mask = intersect_run(&frame, rows, count, &t);                          \
                 tests += count;                                                                    \
                 if (mask) {                                                                        \
                     hits += COUNT16(mask);                                                         \

@@ -14,6 +14,7 @@ typedef int16 VI;
 typedef uint16 VU;
 typedef RayFrame16 VFrame;
 typedef TriangleHit16 VHit;
+typedef Corner16 VCorner;
 #define LANES (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
 #define TRANSPOSE(s, x, y, z, w) TRANSPOSE16(s, x, y, z, w)
 #define STORE_ROW(to, from) STORE_UNALIGNED_QUAD(to, *(const uint4 *)(from))
@@ -23,23 +24,25 @@ typedef TriangleHit16 VHit;
 #define AS_VU as_uint16
 #define FMA_V(a, b, c) FMA16(a, b, c)
 #define MASK_V(m) MASK16(m)
-#define INSIDE_EDGES inside_edges16
+#define SET_FRAME set_frame16
+#define TURN turn16
+#define INSIDE_EDGES inside_edges_rays16
+#define INSIDE_EDGES_LANES inside_edges_lanes16
 #define FINISH_HIT finish_hit16
 #define HALVES(OP, v)                                                                              \
     const float8 v8 = OP((v).lo, (v).hi);                                                          \
     const float4 v4 = OP(v8.lo, v8.hi);
 #else
-DEFINE_RAY_FRAME(RayFrame4, float4)
-typedef struct {
-    float4 t, u, v;
-    int4 hit;
-} TriangleHit4;
-DEFINE_TRIANGLE_TEST(4, float4, int4, FMA4, RayFrame4, float4, TriangleHit4)
+DEFINE_CORNER(Corner4, float4)
+DEFINE_TRIANGLE_HIT(TriangleHit4, float4, int4)
+DEFINE_DIFFERENCE_OF_PRODUCTS(4, float4, FMA4)
+DEFINE_RAYS_TEST(4, float4, int4, FMA4, MASK4)
 typedef float4 VF;
 typedef int4 VI;
 typedef uint4 VU;
 typedef RayFrame4 VFrame;
 typedef TriangleHit4 VHit;
+typedef Corner4 VCorner;
 #define LANES (uint4)(0, 1, 2, 3)
 #define TRANSPOSE(s, to_x, to_y, to_z, to_w)                                                       \
     to_x = (float4)(s[0].x, s[1].x, s[2].x, s[3].x);                                               \
@@ -53,7 +56,10 @@ typedef TriangleHit4 VHit;
 #define AS_VU as_uint4
 #define FMA_V(a, b, c) FMA4(a, b, c)
 #define MASK_V(m) MASK4(m)
-#define INSIDE_EDGES inside_edges4
+#define SET_FRAME set_frame4
+#define TURN turn4
+#define INSIDE_EDGES inside_edges_rays4
+#define INSIDE_EDGES_LANES inside_edges_lanes4
 #define FINISH_HIT finish_hit4
 #define HALVES(OP, v) const float4 v4 = v;
 #endif
@@ -99,19 +105,14 @@ typedef struct {
     VF inverse[3];         // 1 / q
     VF enter, leave;       // the segment, in s; `leave` is that of the closest hit so far
     VF org[3];
-    VF shear[2], scale; // the triangle test's frame for a major axis
-    VF tnear, tfar;
+    VFrame frame;
     VF largest; // m
     VF t;       // closest hit
     VU triangle;
     VF unit[3]; // q
-    VI major;   // axis, by lane
     VU ray;
-    uint axis; // the major axis that all lanes share, or MIXED
     uint live; // lanes that hold a ray
 } SimdRay;
-
-#define MIXED 3
 
 // Bit mask of the lanes that overlap a box.
 inline uint meet(const SimdRay *r, float4 low, float4 high)
@@ -129,97 +130,28 @@ inline uint meet(const SimdRay *r, float4 low, float4 high)
     return MASK_V(enter <= leave);
 }
 
-// The triangle test of triangle.h for rays that share their major axis m; p and q are the next ones. Its sums
-// round once or twice, as the zeros and ones in the frame make the general form round.
-#define FUSED(shear, along, across) FMA_V(shear, along, across)
-#define TWICE(shear, along, across) ((across) + (shear) * (along))
-#define DEFINE_AXIS_TEST(NAME, M, P, Q, m, p, q, FIRST, SECOND)                                    \
-    inline VI NAME(const SimdRay *r, float4 v0, float4 v1, float4 v2, VF *edges, VF *depths)       \
-    {                                                                                              \
-        const VF om = r->org[M], op = r->org[P], oq = r->org[Q];                                   \
-        const VF a = v0.m - om, b = v1.m - om, c = v2.m - om;                                      \
-        const VF px = FIRST(r->shear[0], a, v0.p - op), py = SECOND(r->shear[1], a, v0.q - oq);    \
-        const VF qx = FIRST(r->shear[0], b, v1.p - op), qy = SECOND(r->shear[1], b, v1.q - oq);    \
-        const VF sx = FIRST(r->shear[0], c, v2.p - op), sy = SECOND(r->shear[1], c, v2.q - oq);    \
-        edges[0] = DIFFERENCE_OF_PRODUCTS(sx, qy, sy, qx);                                         \
-        edges[1] = DIFFERENCE_OF_PRODUCTS(px, sy, py, sx);                                         \
-        edges[2] = DIFFERENCE_OF_PRODUCTS(qx, py, qy, px);                                         \
-        depths[0] = r->scale * a, depths[1] = r->scale * b, depths[2] = r->scale * c;              \
-        return ((edges[0] >= 0.0f) & (edges[1] >= 0.0f) & (edges[2] >= 0.0f))                      \
-               | ((edges[0] <= 0.0f) & (edges[1] <= 0.0f) & (edges[2] <= 0.0f));                   \
-    }
-#if WIDTH == 16
-#define DIFFERENCE_OF_PRODUCTS difference_of_products16
-#else
-#define DIFFERENCE_OF_PRODUCTS difference_of_products4
-#endif
-DEFINE_AXIS_TEST(inside_edges_x, 0, 1, 2, x, y, z, FUSED, FUSED)
-DEFINE_AXIS_TEST(inside_edges_y, 1, 2, 0, y, z, x, FUSED, TWICE)
-DEFINE_AXIS_TEST(inside_edges_z, 2, 0, 1, z, x, y, TWICE, TWICE)
-
-inline VFrame mixed_frame(const SimdRay *r)
-{
-    const VI x = r->major == 0, y = r->major == 1;
-    const VF s = r->shear[0], t = r->shear[1], scale = r->scale, one = 1.0f, none = 0.0f;
-    const VFrame frame = {r->org[0],
-                          r->org[1],
-                          r->org[2],
-                          x ? s : (y ? none : one),
-                          x ? one : (y ? s : none),
-                          x ? none : (y ? one : s),
-                          x ? t : (y ? one : none),
-                          x ? none : (y ? t : one),
-                          x ? one : (y ? none : t),
-                          x ? scale : none,
-                          y ? scale : none,
-                          (x | y) ? none : scale,
-                          r->tnear,
-                          r->tfar};
-    return frame;
-}
-
 // Keeps the nearer of two hits, of equal ones the smaller triangle.
-inline void keep_nearer(SimdRay *r, const VFrame *frame, VI inside, const VF *edges,
-                        const VF *depths, uint triangle)
+inline void keep_nearer(SimdRay *r, VI inside, const VF *edges, const VF *depths, uint triangle)
 {
-    const VHit h = FINISH_HIT(frame, inside, edges, depths);
+    const VHit h = FINISH_HIT(&r->frame, inside, edges, depths);
     const VI nearer
         = h.hit & ((h.t < r->t) | ((h.t == r->t) & ((VU)triangle < r->triangle)));
     r->t = nearer ? h.t : r->t;
     r->triangle = nearer ? (VU)triangle : r->triangle;
 }
 
-#define TEST_TRIANGLES(INSIDE, RAYS)                                                               \
-    for (uint k = 0; k < count; k++) {                                                             \
-        global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)slots[k];                   \
-        VF edges[3], depths[3];                                                                    \
-        const VI inside = INSIDE(RAYS, v[0], v[1], v[2], edges, depths);                           \
-        if (MASK_V(inside))                                                                        \
-            keep_nearer(r, &frame, inside, edges, depths, as_uint(v[0].w));                        \
-    }
-
 // Tests a SIMD ray against the triangles in `slots`.
 inline void intersect_triangles(SimdRay *r, const uint *slots, uint count,
                                 global const float4 *triangles)
 {
-    VFrame frame;
-    frame.tnear = r->tnear, frame.tfar = r->tfar;
-    if (r->axis == 0)
-        TEST_TRIANGLES(inside_edges_x, r)
-    else if (r->axis == 1)
-        TEST_TRIANGLES(inside_edges_y, r)
-    else if (r->axis == 2)
-        TEST_TRIANGLES(inside_edges_z, r)
-    else {
-        frame = mixed_frame(r);
-        TEST_TRIANGLES(INSIDE_EDGES, &frame)
+    for (uint k = 0; k < count; k++) {
+        global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)slots[k];
+        VF edges[3], depths[3];
+        const VI inside = INSIDE_EDGES(&r->frame, (global const float *)v, 4, 1, edges, depths);
+        if (MASK_V(inside))
+            keep_nearer(r, inside, edges, depths, as_uint(v[0].w));
     }
 }
-
-typedef struct {
-    VF x, y, z;
-} VCorner;
-DEFINE_TRIANGLE_TEST(_lanes, VF, VI, FMA_V, VFrame, VCorner, VHit)
 
 // The hits of all lanes, each with the triangle that is its closest.
 inline VHit hit_again(const SimdRay *r, global const float4 *triangles)
@@ -231,14 +163,14 @@ inline VHit hit_again(const SimdRay *r, global const float4 *triangles)
         float4 s[WIDTH] __attribute__((aligned(64)));
         for (uint lane = 0; lane < WIDTH; lane++)
             s[lane] = triangles[TRIANGLE_FLOAT4S * (ulong)ids[lane] + k];
-        VF unused;
-        TRANSPOSE(s, corners[k].x, corners[k].y, corners[k].z, unused)
+        VF x, y, z, unused;
+        TRANSPOSE(s, x, y, z, unused)
+        corners[k] = TURN(x, y, z, r->frame.major);
     }
-    const VFrame frame = mixed_frame(r);
     VF edges[3], depths[3];
     const VI inside
-        = inside_edges_lanes(&frame, corners[0], corners[1], corners[2], edges, depths);
-    return finish_hit_lanes(&frame, inside, edges, depths);
+        = INSIDE_EDGES_LANES(&r->frame, corners[0], corners[1], corners[2], edges, depths);
+    return FINISH_HIT(&r->frame, inside, edges, depths);
 }
 
 // Fills the rows from the rays of the lanes; lanes that are not live never hit.
@@ -253,16 +185,9 @@ inline void set_up(SimdRay *r, const VF *origin, const VF *direction, VF tnear, 
     }
     const VF pad = BOX_PAD * (size + most) + SMALLEST_PAD;
     const VF x = magnitude_v(d[0]), y = magnitude_v(d[1]), z = magnitude_v(d[2]);
-    const VI along_x = (x >= y) & (x >= z), along_y = ~along_x & (y >= z);
-    const VF m = along_x ? d[0] : (along_y ? d[1] : d[2]);
-    r->shear[0] = -((along_x ? d[1] : (along_y ? d[2] : d[0])) / m);
-    r->shear[1] = -((along_x ? d[2] : (along_y ? d[0] : d[1])) / m);
-    r->scale = 1.0f / m;
-    r->major = along_x ? (VI)0 : (along_y ? (VI)1 : (VI)2);
-    r->axis = MIXED;
-    for (uint axis = 0; axis < 3; axis++)
-        r->axis = MASK_V(live & (r->major != (int)axis)) == 0 ? axis : r->axis;
-    r->largest = magnitude_v(m);
+    r->largest = x > y ? x : y;
+    r->largest = z > r->largest ? z : r->largest;
+    SET_FRAME(&r->frame, r->org, d, CHOOSE(live, tnear, 0.0f), CHOOSE(live, tfar, -1.0f), live);
     for (uint axis = 0; axis < 3; axis++) {
         r->above[axis] = r->org[axis] + pad, r->below[axis] = r->org[axis] - pad;
         r->unit[axis] = d[axis] / r->largest;
@@ -270,10 +195,7 @@ inline void set_up(SimdRay *r, const VF *origin, const VF *direction, VF tnear, 
         const VF limited = CHOOSE(inverse > LARGEST_INVERSE, LARGEST_INVERSE, inverse);
         r->inverse[axis] = CHOOSE(limited < -LARGEST_INVERSE, -LARGEST_INVERSE, limited);
     }
-    r->tnear = CHOOSE(live, tnear, 0.0f);
-    // A distance that leaves the range of float is no hit: infinity stays above tfar.
-    r->tfar = CHOOSE(live, CHOOSE(tfar < MAXFLOAT, tfar, MAXFLOAT), -1.0f);
-    r->enter = r->tnear * r->largest;
+    r->enter = r->frame.tnear * r->largest;
     r->leave = CHOOSE(live, tfar * r->largest, -INFINITY);
     r->t = INFINITY;
 }

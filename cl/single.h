@@ -83,9 +83,10 @@ inline SingleRay single_ray(const Box *scene, float4 org_tnear, float4 dir_tfar)
 
 inline void test_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
 {
-    const Corner8 v0 = {leaf[0], leaf[1], leaf[2]};
-    const Corner8 v1 = {leaf[3], leaf[4], leaf[5]};
-    const Corner8 v2 = {leaf[6], leaf[7], leaf[8]};
+    const uint x = r->frame.x, y = r->frame.y, z = r->frame.z;
+    const Corner8 v0 = {leaf[x], leaf[y], leaf[z]};
+    const Corner8 v1 = {leaf[3 + x], leaf[3 + y], leaf[3 + z]};
+    const Corner8 v2 = {leaf[6 + x], leaf[6 + y], leaf[6 + z]};
     float8 edges[3], depths[3];
     const int8 inside = inside_edges8(&r->frame, v0, v1, v2, edges, depths);
     c->leaves++;
