@@ -46,8 +46,12 @@ def intersect_pairs(origins, directions, corners, tnear, tfar):
     with np.errstate(all="ignore"):  # infinities and NaN are misses
         turn, shear_x, shear_y, scale = _frames(directions)
         relative = np.take_along_axis(corners - origins[:, None], turn[:, None], axis=2)
-        x, y = (fma(s[:, None], relative[..., 2], relative[..., k]) for k, s in ((0, shear_x), (1, shear_y)))
-        z = scale[:, None] * relative[..., 2]
+        along = relative[..., 2]
+        x, y = (
+            fma(shear[:, None], along, relative[..., k])
+            for k, shear in enumerate((shear_x, shear_y))
+        )
+        z = scale[:, None] * along
         edges = [_difference_of_products(x, y, (k + 2) % 3, (k + 1) % 3) for k in range(3)]
         inside = np.all([edge >= 0 for edge in edges], axis=0)
         inside |= np.all([edge <= 0 for edge in edges], axis=0)

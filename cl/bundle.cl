@@ -61,12 +61,13 @@ inline void set_group(Group *g, const Rays16 *r, const Box *scene, Bounds *bound
 {
     const int16 active = r->tfar >= r->tnear;
     const float16 o[3] = {r->ox, r->oy, r->oz}, d[3] = {r->dx, r->dy, r->dz};
+    const float low[3] = {scene->low.x, scene->low.y, scene->low.z};
+    const float high[3] = {scene->high.x, scene->high.y, scene->high.z};
     float16 per_t = 0.0f, offset = 0.0f, reach = 0.0f;
     for (uint k = 0; k < 3; k++) {
         per_t = larger(per_t, magnitude(d[k]));
         offset = larger(offset, magnitude(o[k]));
-        reach = larger(reach, larger(magnitude(scene->low[k] - o[k]),
-                                     magnitude(scene->high[k] - o[k])));
+        reach = larger(reach, larger(magnitude(low[k] - o[k]), magnitude(high[k] - o[k])));
     }
     const float16 slack = 0x1p-18f * reach + 0x1p-22f * offset;
     for (uint k = 0; k < 3; k++) {

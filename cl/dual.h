@@ -20,52 +20,44 @@
 #define OUTWARDS (1.0f + 0x1p-20f)
 
 typedef struct {
-    float low[3], high[3];
+    float4 low, high;
 } Box;
 
 // A ray against boxes: enter and leave a plane at s = plane * inverse + near, + far.
 typedef struct {
-    float inverse[3], near[3], far[3];
-    float begin, end; // of the ray, in s
-    float per_t;      // s = per_t * t
-    uint low_row[3];  // of a node, the plane at which the ray enters
-    uint unused;      // a cache line
-} BoxRay;
+    float inverse[3], per_t; // s = per_t * t
+    float near[3], begin;    // of the ray, in s
+    float far[3], end;
+    uint low_row[4]; // of a node, the plane at which the ray enters
+} __attribute__((aligned(64))) BoxRay;
 
 inline Box scene_box(global const float8 *root)
 {
-    Box b;
-    for (uint k = 0; k < 3; k++) {
-        b.low[k] = lowest8(root[k]);
-        b.high[k] = highest8(root[3 + k]);
-    }
+    const Box b = {(float4)(lowest8(root[0]), lowest8(root[1]), lowest8(root[2]), 0.0f),
+                   (float4)(highest8(root[3]), highest8(root[4]), highest8(root[5]), 0.0f)};
     return b;
 }
 
-inline BoxRay box_ray(const Box *scene, float4 org_tnear, float4 dir_tfar)
+inline float largest3(float4 v) { return MAX(v.x, MAX(v.y, v.z)); }
+
+inline void set_box_ray(BoxRay *r, const Box *scene, float4 org_tnear, float4 dir_tfar)
 {
-    const float o[3] = {org_tnear.x, org_tnear.y, org_tnear.z};
-    const float d[3] = {dir_tfar.x, dir_tfar.y, dir_tfar.z};
-    BoxRay r;
-    r.per_t = 0.0f;
-    float reach = 0.0f, offset = 0.0f;
-    for (uint k = 0; k < 3; k++) {
-        r.per_t = MAX(r.per_t, size_of(d[k]));
-        offset = MAX(offset, size_of(o[k]));
-        reach = MAX(reach, MAX(size_of(scene->low[k] - o[k]), size_of(scene->high[k] - o[k])));
-    }
-    const float slack = 0x1p-18f * reach + 0x1p-22f * offset;
-    for (uint k = 0; k < 3; k++) {
-        const float slope = d[k] / r.per_t, steep = size_of(slope) < STILL ? STILL : size_of(slope);
-        const float inverse = 1.0f / steep;
-        r.inverse[k] = slope < 0.0f ? -inverse : inverse;
-        r.near[k] = -o[k] * r.inverse[k] - slack * inverse;
-        r.far[k] = -o[k] * r.inverse[k] + slack * inverse;
-        r.low_row[k] = slope < 0.0f ? 3 + k : k;
-    }
-    r.begin = org_tnear.w * r.per_t / OUTWARDS + 0.0f;
-    r.end = MIN(dir_tfar.w, MAXFLOAT) * r.per_t * OUTWARDS;
-    return r;
+    const float4 o = org_tnear, d = dir_tfar;
+    const float4 below = size_of4(scene->low - o), above = size_of4(scene->high - o);
+    const float per_t = largest3(size_of4(d)), reach = largest3(below > above ? below : above);
+    const float slack = 0x1p-18f * reach + 0x1p-22f * largest3(size_of4(o));
+    const float4 slope = d / per_t, size = size_of4(slope);
+    const float4 unsigned_inverse = 1.0f / (size < STILL ? (float4)STILL : size);
+    const int4 falls = slope < 0.0f;
+    const float4 inverse = falls ? -unsigned_inverse : unsigned_inverse;
+    const float4 shift = -o * inverse, widening = slack * unsigned_inverse;
+    float4 near = shift - widening, far = shift + widening;
+    near.w = org_tnear.w * per_t / OUTWARDS + 0.0f;
+    far.w = MIN(dir_tfar.w, MAXFLOAT) * per_t * OUTWARDS;
+    *(float4 *)r->inverse = (float4)(inverse.xyz, per_t);
+    *(float4 *)r->near = near;
+    *(float4 *)r->far = far;
+    *(int4 *)r->low_row = (int4)(0, 1, 2, 0) + (falls & 3);
 }
 
 // Whether the ray enters each child, and where.

@@ -142,7 +142,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
             const uint ray = active_ray(slots, num_slots, i, org_tnear, dir_tfar);                 \
             if (ray == INVALID)                                                                    \
                 continue;                                                                          \
-            s.rays[c.rays] = single_ray(&scene, org_tnear[ray], dir_tfar[ray]);                    \
+            set_single_ray(s.rays + c.rays, &scene, org_tnear[ray], dir_tfar[ray]);                \
             number[c.rays++] = ray;                                                                \
         }                                                                                          \
         if (c.rays != 0)                                                                           \

@@ -21,7 +21,8 @@
             const uint ray = active_ray(slots, num_slots, i, org_tnear, dir_tfar);                 \
             if (ray == INVALID)                                                                    \
                 continue;                                                                          \
-            SingleRay r = single_ray(&scene, org_tnear[ray], dir_tfar[ray]);                       \
+            SingleRay r;                                                                           \
+            set_single_ray(&r, &scene, org_tnear[ray], dir_tfar[ray]);                             \
             walk(&r, &tree, 0, ANY, &c);                                                           \
             c.rays++;                                                                              \
             if (r.nearest != MISS) {                                                               \

@@ -71,14 +71,12 @@ typedef struct {
     float u, v;
 } __attribute__((aligned(64))) SingleRay; // the box in one cache line, frame and nearest in the next
 
-inline SingleRay single_ray(const Box *scene, float4 org_tnear, float4 dir_tfar)
+inline void set_single_ray(SingleRay *r, const Box *scene, float4 org_tnear, float4 dir_tfar)
 {
-    SingleRay r;
-    r.box = box_ray(scene, org_tnear, dir_tfar);
-    r.frame = ray_frame(org_tnear, dir_tfar);
-    r.nearest = MISS;
-    r.u = r.v = 0.0f;
-    return r;
+    set_box_ray(&r->box, scene, org_tnear, dir_tfar);
+    r->frame = ray_frame(org_tnear, dir_tfar);
+    r->nearest = MISS;
+    r->u = r->v = 0.0f;
 }
 
 inline void test_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
