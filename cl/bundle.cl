@@ -16,7 +16,7 @@
 #define GROUPS 4 // of sixteen rays
 #define RAYS (16 * GROUPS)
 #define FEW 6 // rays that are better off alone
-#define CLOSE_END(g, t) ((t) * (g)->per_t * OUTWARDS)
+#define CLOSE_END(per_t, t) ((t) * (per_t) * OUTWARDS)
 
 typedef struct {
     float16 inverse[3], near[3], far[3]; // as in BoxRay
@@ -83,7 +83,7 @@ inline void set_group(Group *g, const Rays16 *r, const Box *scene, Bounds *bound
     set_frame16(&g->frame, o, d, r->tnear, r->tfar, active);
     g->per_t = per_t;
     g->begin = r->tnear * per_t / OUTWARDS + 0.0f;
-    g->end = CLOSE_END(g, g->frame.tfar);
+    g->end = CLOSE_END(g->per_t, g->frame.tfar);
     g->nearest = INVALID;
     float unused = 0.0f;
     widen(&unused, &bounds->slack, slack, active);
@@ -158,6 +158,36 @@ inline uint rays_entering(const Group *g, const Interval *v, global const float 
 
 #define LANE(T, field) (((T *)&g->field)[lane])
 
+INLINED RayFrame frame_of_lane(const Group *g, uint lane)
+{
+    const uint z = LANE(uint, frame.major);
+    const RayFrame f = {LANE(float, frame.ox),      LANE(float, frame.oy),      LANE(float, frame.oz),
+                        LANE(float, frame.shear_x), LANE(float, frame.shear_y), LANE(float, frame.scale),
+                        LANE(float, frame.tnear),   LANE(float, frame.tfar),
+                        z == 2 ? 0 : z + 1,         z == 0 ? 2 : z - 1,         z};
+    return f;
+}
+
+INLINED Closest hit_of_lane(const Group *g, uint lane)
+{
+    const uint triangle = LANE(uint, nearest);
+    const Closest h = {triangle == INVALID ? MISS : hit_key(LANE(float, frame.tfar), triangle),
+                       LANE(float, u), LANE(float, v)};
+    return h;
+}
+
+// The ray's closest hit is `hit`, unless that is a miss.
+INLINED void store_lane(Group *g, uint lane, const Closest *hit)
+{
+    if (hit->key == MISS)
+        return;
+    LANE(float, frame.tfar) = distance_of(hit);
+    LANE(float, end) = CLOSE_END(LANE(float, per_t), distance_of(hit));
+    LANE(uint, nearest) = (uint)hit->key;
+    LANE(float, u) = hit->u;
+    LANE(float, v) = hit->v;
+}
+
 inline SingleRay ray_of_lane(const Group *g, uint lane)
 {
     SingleRay r;
@@ -170,26 +200,9 @@ inline SingleRay ray_of_lane(const Group *g, uint lane)
     r.box.begin = LANE(float, begin);
     r.box.end = LANE(float, end);
     r.box.per_t = LANE(float, per_t);
-    const uint z = LANE(uint, frame.major);
-    const RayFrame f = {LANE(float, frame.ox),      LANE(float, frame.oy),      LANE(float, frame.oz),
-                        LANE(float, frame.shear_x), LANE(float, frame.shear_y), LANE(float, frame.scale),
-                        LANE(float, frame.tnear),   LANE(float, frame.tfar),
-                        z == 2 ? 0 : z + 1,         z == 0 ? 2 : z - 1,         z};
-    r.frame = f;
-    const uint triangle = LANE(uint, nearest);
-    r.nearest = triangle == INVALID ? MISS : hit_key(f.tfar, triangle);
-    r.u = LANE(float, u);
-    r.v = LANE(float, v);
+    r.frame = frame_of_lane(g, lane);
+    r.hit = hit_of_lane(g, lane);
     return r;
-}
-
-inline void store_lane(Group *g, uint lane, const SingleRay *r)
-{
-    LANE(float, frame.tfar) = r->frame.tfar;
-    LANE(float, end) = r->box.end;
-    LANE(uint, nearest) = r->nearest == MISS ? INVALID : (uint)r->nearest;
-    LANE(float, u) = r->u;
-    LANE(float, v) = r->v;
 }
 
 // Rays of `mask` of one group finish `node` alone; returns those that have a hit.
@@ -200,8 +213,24 @@ inline uint finish_alone(Group *g, uint mask, const Tree *tree, uint node, bool 
         const uint lane = LOWEST(mask);
         SingleRay r = ray_of_lane(g, lane);
         walk(&r, tree, node, any, c);
-        store_lane(g, lane, &r);
-        hit |= (uint)(r.nearest != MISS) << lane;
+        store_lane(g, lane, &r.hit);
+        hit |= (uint)(r.hit.key != MISS) << lane;
+    }
+    return hit;
+}
+
+// The same in a leaf.
+inline uint test_alone(Group *g, uint mask, global const float8 *leaf, Counts *c)
+{
+    uint hit = 0;
+    for (; mask != 0; mask &= mask - 1) {
+        const uint lane = LOWEST(mask);
+        const RayFrame frame = frame_of_lane(g, lane);
+        Closest closest = hit_of_lane(g, lane);
+        if (test_leaf(&frame, &closest, leaf, c)) {
+            store_lane(g, lane, &closest);
+            hit |= 1u << lane;
+        }
     }
     return hit;
 }
@@ -220,7 +249,7 @@ inline uint test_triangle(Group *g, uint mask, global const float *leaf, uint k,
     const int16 nearer = h.hit & ((h.t < g->frame.tfar) | (triangle < g->nearest));
     g->frame.tfar = nearer ? h.t : g->frame.tfar;
     g->nearest = nearer ? (uint16)triangle : g->nearest;
-    g->end = nearer ? CLOSE_END(g, h.t) : g->end;
+    g->end = nearer ? CLOSE_END(g->per_t, h.t) : g->end;
     g->u = nearer ? h.u : g->u;
     g->v = nearer ? h.v : g->v;
     const uint hit = MASK16(h.hit);
@@ -269,7 +298,7 @@ inline void test_leaf_bundle(Bundle *b, ulong mask, const Tree *tree, uint node,
             continue;
         uint hit = 0;
         if (COUNT16(rays) < count)
-            hit = finish_alone(b->groups + g, rays, tree, node, b->any, c);
+            hit = test_alone(b->groups + g, rays, leaf, c);
         else
             for (uint left = triangles; left != 0; left &= left - 1)
                 hit |= test_triangle(b->groups + g, rays, (global const float *)leaf, LOWEST(left),

@@ -51,7 +51,7 @@ inline void finish_list(Stream *s, const Tree *tree, List list, Counts *c)
 {
     for (uint i = 0; i < list.count; i++) {
         SingleRay *r = s->rays + s->ids[list.begin + i];
-        if (!(s->any && r->nearest != MISS))
+        if (!(s->any && r->hit.key != MISS))
             walk(r, tree, list.node, s->any, c);
     }
 }
@@ -67,7 +67,7 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
         const SingleRay *r = s->rays + s->ids[list.begin + i];
         float8 enter;
         int8 enters = enter_children(&r->box, rows, &enter);
-        if (s->any && r->nearest != MISS)
+        if (s->any && r->hit.key != MISS)
             enters = 0;
         s->entered[i] = (uchar)MASK8(enters);
         sum += enters ? enter : 0.0f;
@@ -116,8 +116,8 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
             global const float8 *leaf = tree->leaves + (ulong)(list.node & ~LEAF) * LEAF_ROWS;
             for (uint i = 0; i < list.count; i++) {
                 SingleRay *r = s->rays + s->ids[list.begin + i];
-                if (!(s->any && r->nearest != MISS))
-                    test_leaf(r, leaf, c);
+                if (!(s->any && r->hit.key != MISS))
+                    visit_leaf(r, leaf, c);
             }
         } else if (list.count <= FEW || list.begin + 9 * list.count > ROOM) {
             finish_list(s, tree, list, c);
@@ -150,7 +150,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
         for (uint i = 0; i < c.rays; i++) {                                                        \
             const SingleRay *r = s.rays + i;                                                       \
             const uint ray = number[i];                                                            \
-            if (r->nearest != MISS) {                                                              \
+            if (r->hit.key != MISS) {                                                              \
                 STORE;                                                                             \
             }                                                                                      \
         }                                                                                          \
@@ -158,5 +158,5 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
     }
 
 DEFINE_STREAM(intersect_stream, false, HITS_ARGUMENTS,
-              STORE_HIT(ray, r->frame.tfar, (uint)r->nearest, r->u, r->v))
+              STORE_HIT(ray, r->frame.tfar, (uint)r->hit.key, r->hit.u, r->hit.v))
 DEFINE_STREAM(occlude_stream, true, global uchar *restrict blocked, blocked[ray] = 1)

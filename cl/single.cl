@@ -25,7 +25,7 @@
             set_single_ray(&r, &scene, org_tnear[ray], dir_tfar[ray]);                             \
             walk(&r, &tree, 0, ANY, &c);                                                           \
             c.rays++;                                                                              \
-            if (r.nearest != MISS) {                                                               \
+            if (r.hit.key != MISS) {                                                               \
                 STORE;                                                                             \
             }                                                                                      \
         }                                                                                          \
@@ -33,5 +33,5 @@
     }
 
 DEFINE_SINGLE(intersect_single, false, HITS_ARGUMENTS,
-              STORE_HIT(ray, r.frame.tfar, (uint)r.nearest, r.u, r.v))
+              STORE_HIT(ray, r.frame.tfar, (uint)r.hit.key, r.hit.u, r.hit.v))
 DEFINE_SINGLE(occlude_single, true, global uchar *restrict blocked, blocked[ray] = 1)

@@ -63,55 +63,70 @@ inline uint active_ray(global const uint *slots, uint num_slots, uint i,
 #define STORE_HIT(ray, t, triangle, u, v)                                                          \
     (hit_t[ray] = (t), hit_triangle[ray] = (triangle), hit_u[ray] = (u), hit_v[ray] = (v))
 
-// `nearest` is the key of the hit so far, at weights u and v of its triangle.
+// The closest hit so far: its key, and weights of its triangle's vertices.
+typedef struct {
+    ulong key;
+    float u, v;
+} Closest;
+
 typedef struct {
     BoxRay box;
     RayFrame frame;
-    ulong nearest;
-    float u, v;
-} __attribute__((aligned(64))) SingleRay; // the box in one cache line, frame and nearest in the next
+    Closest hit;
+} __attribute__((aligned(64))) SingleRay; // the box in one cache line, the rest in the next
 
 inline void set_single_ray(SingleRay *r, const Box *scene, float4 org_tnear, float4 dir_tfar)
 {
     set_box_ray(&r->box, scene, org_tnear, dir_tfar);
     r->frame = ray_frame(org_tnear, dir_tfar);
-    r->nearest = MISS;
-    r->u = r->v = 0.0f;
+    r->hit.key = MISS;
+    r->hit.u = r->hit.v = 0.0f;
 }
 
-inline void test_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
+// Whether one of a leaf's triangles is hit nearer than `hit`, which becomes that hit.
+INLINED bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *leaf, Counts *c)
 {
-    const uint x = r->frame.x, y = r->frame.y, z = r->frame.z;
+    const uint x = frame->x, y = frame->y, z = frame->z;
     const Corner8 v0 = {leaf[x], leaf[y], leaf[z]};
     const Corner8 v1 = {leaf[3 + x], leaf[3 + y], leaf[3 + z]};
     const Corner8 v2 = {leaf[6 + x], leaf[6 + y], leaf[6 + z]};
     float8 edges[3], depths[3];
-    const int8 inside = inside_edges8(&r->frame, v0, v1, v2, edges, depths);
+    const int8 inside = inside_edges8(frame, v0, v1, v2, edges, depths);
     c->leaves++;
     c->tests += TREE_WIDTH;
     if (MASK8(inside) == 0)
-        return;
-    const TriangleHit8 h = finish_hit8(&r->frame, inside, edges, depths);
+        return false;
+    const TriangleHit8 h = finish_hit8(frame, inside, edges, depths);
     uint mask = MASK8(h.hit);
     if (mask == 0)
-        return;
+        return false;
     c->hits += COUNT16(mask);
     float t[8] __attribute__((aligned(32))), u[8] __attribute__((aligned(32))),
         v[8] __attribute__((aligned(32)));
     *(float8 *)t = h.t;
     *(float8 *)u = h.u;
     *(float8 *)v = h.v;
+    const ulong before = hit->key;
     for (; mask != 0; mask &= mask - 1) {
         const uint k = LOWEST(mask);
         const ulong key = hit_key(t[k], ((global const uint *)(leaf + LEAF_TRIANGLE_ROW))[k]);
-        if (key < r->nearest) {
-            r->nearest = key;
-            r->u = u[k];
-            r->v = v[k];
+        if (key < hit->key) {
+            hit->key = key;
+            hit->u = u[k];
+            hit->v = v[k];
         }
     }
+    return hit->key != before;
+}
+
+inline float distance_of(const Closest *hit) { return as_float((uint)(hit->key >> 32)); }
+
+inline void visit_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
+{
+    if (!test_leaf(&r->frame, &r->hit, leaf, c))
+        return;
     // Equal distances still hit, and are still entered.
-    r->frame.tfar = as_float((uint)(r->nearest >> 32));
+    r->frame.tfar = distance_of(&r->hit);
     r->box.end = r->frame.tfar * r->box.per_t * OUTWARDS;
 }
 
@@ -125,8 +140,8 @@ inline void walk(SingleRay *r, const Tree *tree, uint node, bool any, Counts *c)
     uint top = 0;
     for (;;) {
         if (node & LEAF) {
-            test_leaf(r, tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS, c);
-            if (any && r->nearest != MISS)
+            visit_leaf(r, tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS, c);
+            if (any && r->hit.key != MISS)
                 return;
         } else {
             global const float8 *rows = tree->nodes + (ulong)node * TREE_ROWS;

@@ -72,7 +72,7 @@ DEFINE_TRIANGLE_HIT(TriangleHit16, float16, int16)
 // Edges only: whether a hit of the triangle's plane would lie inside. FRAME and CORNER in lanes of F; what is
 // not a vector yet is the same in all lanes.
 #define DEFINE_INSIDE_EDGES(NAME, SUFFIX, F, I, FMA, FRAME, CORNER)                                \
-    inline I NAME(const FRAME *r, CORNER v0, CORNER v1, CORNER v2, F *edges, F *depths)            \
+    INLINED I NAME(const FRAME *r, CORNER v0, CORNER v1, CORNER v2, F *edges, F *depths)            \
     {                                                                                              \
         const F ox = (F)(r->ox), oy = (F)(r->oy), oz = (F)(r->oz);                                 \
         const F shear_x = (F)(r->shear_x), shear_y = (F)(r->shear_y), scale = (F)(r->scale);       \
@@ -93,7 +93,7 @@ DEFINE_TRIANGLE_HIT(TriangleHit16, float16, int16)
 // first among the bit patterns. Weights before depths: edges times depths would leave the range of
 // float in large and tiny scenes.
 #define DEFINE_FINISH_HIT(NAME, F, I, FRAME, HIT)                                                  \
-    inline HIT NAME(const FRAME *r, I inside, const F *edges, const F *depths)                     \
+    INLINED HIT NAME(const FRAME *r, I inside, const F *edges, const F *depths)                     \
     {                                                                                              \
         HIT h;                                                                                     \
         const F det = edges[0] + edges[1] + edges[2];                                              \
