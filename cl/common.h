@@ -10,6 +10,10 @@
 
 #define INVALID 0xffffffffu
 
+// For what works on vectors in private memory: PoCL leaves large functions calls, which pass them
+// through memory.
+#define INLINE inline __attribute__((always_inline))
+
 #define CONCAT_(a, b) a##b
 #define CONCAT(a, b) CONCAT_(a, b)
 

@@ -90,7 +90,7 @@ inline uint16 cell(float16 x, float low, float extent, uint bits)
 
 #ifdef HASH_PAPER
 
-inline uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
+INLINE uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
 {
     const float16 azimuth = atan2(r.dy, r.dx) * (0.5f / M_PI_F) + 0.5f;
     const float16 polar = atan2(sqrt(r.dx * r.dx + r.dy * r.dy), r.dz) * (1.0f / M_PI_F);
@@ -110,7 +110,7 @@ inline uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
 #else
 
 // The direction on the octahedron, unfolded to the square of 2^WIDE_BITS cells (Meyer et al. 2010).
-inline void octahedral(const Rays16 *r, uint16 *x, uint16 *y)
+INLINE void octahedral(const Rays16 *r, uint16 *x, uint16 *y)
 {
     const float16 mx = magnitude(r->dx), my = magnitude(r->dy), mz = magnitude(r->dz);
     const float16 largest = larger(mx, larger(my, mz)); // first, so that the sum stays finite
@@ -142,7 +142,7 @@ inline uint16 place(float16 x, float16 y, float16 z, Box box, uint bits)
                          cell(z, box.low.z, box.extent.z, bits), bits);
 }
 
-inline uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
+INLINE uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
 {
     if (largest(origins.extent) <= 0.0f && largest(ends.extent) < INFINITY)
         return place(FMA16(r.dx, r.tfar, r.ox), FMA16(r.dy, r.tfar, r.oy),

@@ -135,15 +135,28 @@ kernel void resolve_hits(const uint num_rays, global const ulong *restrict close
     v[i] = h.v;
 }
 
-// Flat triangle numbers into (geometry, face within it); -1 where missed.
-kernel void split_ids(const uint num_rays, global const uint *restrict triangle,
-                      global const uint *restrict geom_ids, global const uint *restrict first_prims,
-                      global int *restrict geom_id, global int *restrict prim_id)
+// Misses: inf, INVALID, 0, 0.
+kernel void miss_all(const uint num_rays, global float *restrict t, global uint *restrict triangle,
+                     global float *restrict u, global float *restrict v)
 {
-    const uint i = get_global_id(0);
-    if (i >= num_rays)
-        return;
-    const uint id = triangle[i];
-    geom_id[i] = id == INVALID ? -1 : (int)geom_ids[id];
-    prim_id[i] = id == INVALID ? -1 : (int)(id - first_prims[geom_ids[id]]);
+    for (ulong i = chunk_begin(num_rays), end = chunk_end(num_rays); i < end; i++)
+        t[i] = INFINITY, triangle[i] = INVALID, u[i] = 0.0f, v[i] = 0.0f;
+}
+
+// Flat triangle numbers into (geometry, face within it); -1 where missed.
+kernel void split_ids(const uint num_rays, const uint num_meshes,
+                      global const uint *restrict triangle, global const uint *restrict geom_ids,
+                      global const uint *restrict first_prims, global int *restrict geom_id,
+                      global int *restrict prim_id)
+{
+    for (ulong i = chunk_begin(num_rays), end = chunk_end(num_rays); i < end; i++) {
+        const uint id = triangle[i];
+        uint mesh = id == INVALID ? INVALID : 0, first = 0;
+        if (num_meshes > 1 && id != INVALID) {
+            mesh = geom_ids[id];
+            first = first_prims[mesh];
+        }
+        geom_id[i] = (int)mesh;
+        prim_id[i] = (int)(id - first);
+    }
 }

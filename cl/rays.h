@@ -8,7 +8,7 @@ typedef struct {
     float16 ox, oy, oz, tnear, dx, dy, dz, tfar;
 } Rays16;
 
-inline Rays16 transpose_rays(const float4 *origins, const float4 *directions)
+INLINE Rays16 transpose_rays(const float4 *origins, const float4 *directions)
 {
     Rays16 r;
     TRANSPOSE16(origins, r.ox, r.oy, r.oz, r.tnear);
@@ -17,7 +17,7 @@ inline Rays16 transpose_rays(const float4 *origins, const float4 *directions)
 }
 
 // The rays first, first + 1, ...; inactive (tfar = -inf) from `stop` on.
-inline Rays16 load_rays(ulong first, ulong stop, global const float4 *org_tnear,
+INLINE Rays16 load_rays(ulong first, ulong stop, global const float4 *org_tnear,
                         global const float4 *dir_tfar)
 {
     float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));
@@ -32,7 +32,7 @@ inline Rays16 load_rays(ulong first, ulong stop, global const float4 *org_tnear,
 
 // The rays in slots first, first + step, ...; inactive (tfar = -inf) from slot `stop` on and where a slot
 // holds no ray.
-inline Rays16 gather_rays(ulong first, uint step, ulong stop, global const uint *slots,
+INLINE Rays16 gather_rays(ulong first, uint step, ulong stop, global const uint *slots,
                           global const float4 *org_tnear, global const float4 *dir_tfar)
 {
     float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));

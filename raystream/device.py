@@ -152,6 +152,7 @@ class Session:
         self._allocator = cl.tools.ImmediateAllocator(self.queue)
         self.pool = cl.tools.MemoryPool(self._allocator, leading_bits_in_bin_id=1)
         self._nothing = self.pool.allocate(64)
+        self._in_host_memory = bool(device.type & cl.device_type.CPU)
         self.clock = StageClock()
         self.cache = {}  # small device arrays that stages keep between calls, by their own keys
         self._kernels = {}
@@ -239,7 +240,40 @@ class Session:
             self.clock.record(stage, event)
         return target
 
+    def share(self, stage, array):
+        """A kernel's argument that holds a contiguous numpy array, which must not change meanwhile.
+
+        A device that works in the host's memory reads the array where it is, others get a copy.
+        """
+        if not self._in_host_memory or not array.nbytes:
+            return self.upload(stage, array)
+        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
+        return cl.Buffer(self.context, flags, hostbuf=np.ascontiguousarray(array))
+
+    def download(self, *arrays):
+        """Device arrays, which the caller gives up, as numpy arrays; waits for the launches.
+
+        A device that works in the host's memory hands out that memory: nothing is copied, and the
+        pool gets it back when the last array that looks at it is gone.
+        """
+        if not self._in_host_memory:
+            return [array.get() for array in arrays]
+        mapped = [_Mapped(array) if array.nbytes else array.get() for array in arrays]
+        self.queue.finish()
+        return [np.asarray(array) for array in mapped]
+
     def finish(self):
         """Wait for all launches; return the seconds by stage since the last call."""
         self.queue.finish()
         return self.clock.take()
+
+
+class _Mapped:
+    """A device array's memory as the host sees it: keeps it from the pool."""
+
+    def __init__(self, array):
+        flags = cl.map_flags.READ | cl.map_flags.WRITE
+        order = array.queue, array.base_data, flags, array.offset, array.shape, array.dtype
+        self._view, _ = cl.enqueue_map_buffer(*order, is_blocking=False)
+        self._array = array
+        self.__array_interface__ = self._view.__array_interface__

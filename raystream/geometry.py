@@ -44,7 +44,6 @@ class Geometry:
         self.first_prims = session.upload(GEOMETRY, scene.first_prims.astype(np.uint32))
         self.triangles = session.empty((self._num_blocks * _BLOCK, 12), np.float32)
         self._bounds, self._bounds_version = None, None
-        self._vertices = session.empty(scene.vertices.shape, np.float32)
         self._kernels = session.kernels("geometry.cl", GATHERED=_GATHERED)
         self.update(scene.vertices)
 
@@ -57,12 +56,13 @@ class Geometry:
         return self._current_bounds()[1]
 
     def update(self, vertices):
-        """Take new vertices, (N, 3) float32 in the scene's order; topology unchanged."""
-        self.session.upload(GEOMETRY, vertices, self._vertices)
-        self._gather(self._vertices)
-        self.version += 1
+        """Take new vertices, (N, 3) float32 in the scene's order; topology unchanged.
 
-    def _gather(self, vertices):
+        The array must not change until the device has been waited for.
+        """
+        self.session.queue.finish()  # before the vertices that are being gathered may go
+        self._vertices = self.session.share(GEOMETRY, vertices)
+        self.version += 1
         padded = self._num_blocks * _BLOCK
         self.session.launch(
             GEOMETRY,
@@ -70,7 +70,7 @@ class Geometry:
             -(-padded // _GATHERED),
             np.uint32(self.num_triangles),
             np.uint32(padded),
-            vertices,
+            self._vertices,
             self.faces,
             self.triangles,
         )

@@ -9,7 +9,7 @@ from raystream.pairs import CHUNKS
 from raystream.statistics import FINAL_INTERSECTION
 
 _LOCAL = 64
-_INVALID = np.uint32(0xFFFFFFFF)
+_CHUNKS_PER_UNIT = 8
 _MISS = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -42,8 +42,7 @@ class HitStream:
     def misses(cls, session, count):
         """Misses of `count` rays."""
         hits = cls.empty(session, count)
-        for field, miss in ((hits.t, np.inf), (hits.triangle, _INVALID), (hits.u, 0), (hits.v, 0)):
-            session.fill(FINAL_INTERSECTION, field, miss)
+        _launch(session, "miss_all", np.uint32(count), hits.t, hits.triangle, hits.u, hits.v)
         return hits
 
 
@@ -118,16 +117,22 @@ def split_ids(session, hits, geometry):
     """(geom_id, prim_id) of the hits, int32 arrays of shape (n,), -1 where missed."""
     count = hits.triangle.shape[0]
     geom_id, prim_id = session.empty(count, np.int32), session.empty(count, np.int32)
-    session.launch(
-        FINAL_INTERSECTION,
-        session.kernels("intersect.cl", CHUNKS=CHUNKS)["split_ids"],
-        count,
+    _launch(
+        session,
+        "split_ids",
         np.uint32(count),
+        np.uint32(geometry.first_prims.shape[0] - 1),
         hits.triangle,
         geometry.geom_ids,
         geometry.first_prims,
         geom_id,
         prim_id,
-        local=_LOCAL,
     )
     return geom_id, prim_id
+
+
+def _launch(session, kernel, *args):
+    """Run a kernel of this file, a work-item for each chunk."""
+    chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
+    kernels = session.kernels("intersect.cl", CHUNKS=chunks)
+    session.launch(FINAL_INTERSECTION, kernels[kernel], chunks, *args)

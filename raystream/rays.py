@@ -9,6 +9,7 @@ from raystream.checks import as_float_array, check_rows
 from raystream.statistics import RAY_CREATION
 
 _LOCAL = 64
+_CHUNKS_PER_UNIT = 8
 
 
 @dataclasses.dataclass
@@ -57,10 +58,10 @@ def from_numpy(session, origins, directions, tnear, tfar):
     directions = as_float_array("directions", directions, (len(origins), 3))
     tnear = _per_ray("tnear", tnear, len(origins))
     tfar = _per_ray("tfar", tfar, len(origins))
-    upload = [session.upload(RAY_CREATION, array) for array in (origins, directions)]
+    shared = [session.share(RAY_CREATION, array) for array in (origins, directions)]
     bounds = [_on_device(session, value) for value in (tnear, tfar)]
-    packed, first_invalid = _pack(session, *upload, *bounds)
-    if first_invalid < len(origins):
+    packed, first_refused = _pack(session, len(origins), *shared, *bounds)
+    if first_refused < len(origins):
         _refuse(origins, directions, tnear, tfar)
     return packed
 
@@ -86,27 +87,26 @@ def from_device(session, origins, directions, tnear, tfar):
     for name, array in (("origins", origins), ("directions", directions)):
         _check_device_array(name, array, (count, 3))
     bounds = [_per_ray_on_device(session, *x, count) for x in (("tnear", tnear), ("tfar", tfar))]
-    packed, first_invalid = _pack(session, origins, directions, *bounds)
-    if first_invalid < count:
+    packed, first_refused = _pack(session, count, origins, directions, *bounds)
+    if first_refused < count:
         raise ValueError(
             "rays: need finite origins and directions, directions that are not zero, tnear >= 0 "
-            f"and tfar not NaN, not so at index {first_invalid}"
+            f"and tfar not NaN, not so at index {first_refused}"
         )
     return packed
 
 
-def _pack(session, origins, directions, tnear, tfar):
-    """Rays, and the index of the first that no tracer can take; their number where all are good."""
-    count = origins.shape[0]
+def _pack(session, count, origins, directions, tnear, tfar):
+    """Rays, and the index of the first that no tracer can take; a larger one where all are good."""
     packed = Rays(*(session.empty((count, 4), np.float32) for _ in range(2)))
     if count == 0:
         return packed, 0
-    first_invalid = session.empty(1, np.uint32)
-    session.fill(RAY_CREATION, first_invalid, count)
+    chunks = _chunks(session)
+    first_refused = session.empty(chunks, np.uint32)
     session.launch(
         RAY_CREATION,
-        session.kernels("rays.cl")["pack_rays"],
-        count,
+        _kernels(session)["pack_rays"],
+        chunks,
         np.uint32(count),
         origins,
         directions,
@@ -114,10 +114,17 @@ def _pack(session, origins, directions, tnear, tfar):
         *tfar,
         packed.org_tnear,
         packed.dir_tfar,
-        first_invalid,
-        local=_LOCAL,
+        first_refused,
     )
-    return packed, int(first_invalid.get()[0])
+    return packed, int(first_refused.get().min())  # waits: shared arrays may change from here on
+
+
+def _chunks(session):
+    return _CHUNKS_PER_UNIT * session.device.max_compute_units
+
+
+def _kernels(session):
+    return session.kernels("rays.cl", CHUNKS=_chunks(session))
 
 
 def from_camera(session, camera, size, offset=(0.5, 0.5)):
@@ -130,7 +137,7 @@ def from_camera(session, camera, size, offset=(0.5, 0.5)):
     vectors = (camera.eye, right * tangent * width / height, up * tangent, forward)
     session.launch(
         RAY_CREATION,
-        session.kernels("rays.cl")["camera_rays"],
+        _kernels(session)["camera_rays"],
         width * height,
         np.uint32(width),
         np.uint32(height),
@@ -169,4 +176,4 @@ def _per_ray_on_device(session, name, value, count):
 
 def _on_device(session, value):
     value = np.atleast_1d(value)
-    return session.upload(RAY_CREATION, value), np.uint32(len(value) > 1)
+    return session.share(RAY_CREATION, value), np.uint32(len(value) > 1)

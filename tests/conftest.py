@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 import pytest
 
-from raystream import device
+from raystream import device, program
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +25,18 @@ def scene_folder():
     if not folder:
         pytest.skip("RAYSTREAM_SCENES does not name the folder of test scenes")
     return pathlib.Path(folder)
+
+
+@pytest.fixture
+def portable(monkeypatch):
+    """Sessions made inside compile without the x86 built-ins."""
+    monkeypatch.setattr(program, "_OPTIONS", (*program._OPTIONS, "-DPORTABLE"))
+    monkeypatch.setattr(device, "_thread", type(device._thread)())
+
+
+@pytest.fixture(params=["built-ins", "portable"])
+def path(request):
+    """Both paths of cl/simd.h, for what is compiled inside."""
+    if request.param == "portable":
+        request.getfixturevalue("portable")
+    return request.param

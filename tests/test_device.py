@@ -1,5 +1,6 @@
 """Choosing a device, sessions, the stage clock."""
 
+import gc
 import threading
 
 import numpy as np
@@ -41,7 +42,7 @@ def test_one_session_per_thread_and_device():
 
 
 def test_kernels_are_built_once(session):
-    assert session.kernels("rays.cl") is session.kernels("rays.cl")
+    assert session.kernels("brute.cl") is session.kernels("brute.cl")
 
 
 def test_stage_times_add_up(session):
@@ -67,3 +68,52 @@ def test_upload_and_back(session, shape, rng):
     back = session.upload("upload", host).get()
     assert back.dtype == np.float32
     np.testing.assert_array_equal(back, host)
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (1,), (65, 3)])
+def test_downloads_are_the_callers_own(session, shape, rng):
+    host = rng.random(shape).astype(np.float32)
+    (mine,) = session.download(session.upload("upload", host))
+    np.testing.assert_array_equal(mine, host)
+    assert mine.dtype == np.float32 and mine.shape == shape and mine.flags.writeable
+    mine += 1
+    for _ in range(3):  # nothing else gets this memory while `mine` is there
+        session.fill("fill", session.empty(shape, np.float32), 9)
+    session.finish()
+    np.testing.assert_array_equal(mine, host + 1)
+
+
+def test_memory_of_downloads_goes_back_to_the_pool(session):
+    session.trim()
+    before = session.pool.managed_bytes
+    for _ in range(20):
+        (part,) = session.download(session.empty(1 << 18, np.float32))
+        part = part[5:].view(np.int32)  # what looks at it keeps it
+    assert session.pool.managed_bytes - before <= 3 * part.base.nbytes
+
+
+def test_downloads_outlive_their_session(rng):
+    host, found = rng.random(10_007), []
+
+    def work():
+        session = device.session()
+        found.extend(session.download(session.upload("upload", host)))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    gc.collect()
+    np.testing.assert_array_equal(found[0], host)
+    found.clear()
+
+
+def test_a_device_with_its_own_memory_gets_and_gives_copies(session, rng, monkeypatch):
+    tracer = rs.Tracer(rs.scenes.cornell())
+    rays = rng.random((2, 1009, 3))
+    expected = tracer.intersect(*rays)
+    monkeypatch.setattr(session, "_in_host_memory", False)
+    tracer.update_vertices(tracer.scene.vertices)
+    hits = tracer.intersect(*rays)
+    for field in ("t", "prim_id", "geom_id", "u", "v"):
+        np.testing.assert_array_equal(getattr(hits, field), getattr(expected, field))
+    assert hits.t.flags.owndata

@@ -8,20 +8,6 @@ import raystream as rs
 from raystream import device, program
 
 
-@pytest.fixture
-def portable(monkeypatch):
-    """Sessions made inside compile without the x86 built-ins."""
-    monkeypatch.setattr(program, "_OPTIONS", (*program._OPTIONS, "-DPORTABLE"))
-    monkeypatch.setattr(device, "_thread", type(device._thread)())
-
-
-@pytest.fixture(params=["built-ins", "portable"])
-def path(request):
-    if request.param == "portable":
-        request.getfixturevalue("portable")
-    return request.param
-
-
 @pytest.mark.parametrize("method", rs.methods())
 def test_hits_and_counts_are_the_same_on_both_paths(method, request, rng):
     scene = triangle_soup(rng, 700, size=0.3)
