@@ -158,7 +158,7 @@ inline uint rays_entering(const Group *g, const Interval *v, global const float 
 
 #define LANE(T, field) (((T *)&g->field)[lane])
 
-INLINED RayFrame frame_of_lane(const Group *g, uint lane)
+INLINE RayFrame frame_of_lane(const Group *g, uint lane)
 {
     const uint z = LANE(uint, frame.major);
     const RayFrame f = {LANE(float, frame.ox),      LANE(float, frame.oy),      LANE(float, frame.oz),
@@ -168,7 +168,7 @@ INLINED RayFrame frame_of_lane(const Group *g, uint lane)
     return f;
 }
 
-INLINED Closest hit_of_lane(const Group *g, uint lane)
+INLINE Closest hit_of_lane(const Group *g, uint lane)
 {
     const uint triangle = LANE(uint, nearest);
     const Closest h = {triangle == INVALID ? MISS : hit_key(LANE(float, frame.tfar), triangle),
@@ -177,7 +177,7 @@ INLINED Closest hit_of_lane(const Group *g, uint lane)
 }
 
 // The ray's closest hit is `hit`, unless that is a miss.
-INLINED void store_lane(Group *g, uint lane, const Closest *hit)
+INLINE void store_lane(Group *g, uint lane, const Closest *hit)
 {
     if (hit->key == MISS)
         return;
@@ -411,17 +411,15 @@ inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, b
         c.rays = COUNT64(b.open);                                                                  \
         if (b.open != 0)                                                                           \
             walk_bundle(&b, &tree, &c);                                                            \
-        for (uint i = 0; i < RAYS; i++) {                                                          \
+        for (uint i = 0; i < RAYS && first + i < num_slots; i++) {                                 \
             const Group *g = b.groups + i / 16;                                                    \
-            const uint lane = i % 16, triangle = LANE(uint, nearest);                              \
-            if (triangle != INVALID) {                                                             \
-                const uint ray = slots[first + i];                                                 \
-                STORE;                                                                             \
-            }                                                                                      \
+            const uint lane = i % 16, ray = slots[first + i];                                      \
+            if (ray != INVALID)                                                                    \
+                STORE(ray, LANE(float, frame.tfar), LANE(float, u), LANE(float, v),                \
+                      LANE(uint, nearest));                                                        \
         }                                                                                          \
         store_counts(&c, counts);                                                                  \
     }
 
-DEFINE_BUNDLE(intersect_bundle, false, HITS_ARGUMENTS,
-              STORE_HIT(ray, LANE(float, frame.tfar), triangle, LANE(float, u), LANE(float, v)))
-DEFINE_BUNDLE(occlude_bundle, true, global uchar *restrict blocked, blocked[ray] = 1)
+DEFINE_BUNDLE(intersect_bundle, false, HIT_RECORDS, STORE_RECORD)
+DEFINE_BUNDLE(occlude_bundle, true, BLOCKED_FLAGS, STORE_FLAG)

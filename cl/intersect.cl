@@ -135,12 +135,26 @@ kernel void resolve_hits(const uint num_rays, global const ulong *restrict close
     v[i] = h.v;
 }
 
-// Misses: inf, INVALID, 0, 0.
-kernel void miss_all(const uint num_rays, global float *restrict t, global uint *restrict triangle,
-                     global float *restrict u, global float *restrict v)
+// Records of t, u, v and the triangle (single.h) as hits.
+kernel void unpack_hits(const uint num_rays, global const float4 *restrict records,
+                        global float *restrict t, global uint *restrict triangle,
+                        global float *restrict u, global float *restrict v)
 {
-    for (ulong i = chunk_begin(num_rays), end = chunk_end(num_rays); i < end; i++)
-        t[i] = INFINITY, triangle[i] = INVALID, u[i] = 0.0f, v[i] = 0.0f;
+    const ulong runs = num_rays / 16, stop = 16 * chunk_end(runs);
+    for (ulong i = 16 * chunk_begin(runs); i < stop; i += 16) {
+        global const float4 *s = records + i;
+        float16 ts, us, vs, triangles;
+        TRANSPOSE16(s, ts, us, vs, triangles);
+        STORE_UNALIGNED(float16, t + i, ts);
+        STORE_UNALIGNED(uint16, triangle + i, as_uint16(triangles));
+        STORE_UNALIGNED(float16, u + i, us);
+        STORE_UNALIGNED(float16, v + i, vs);
+    }
+    if (get_global_id(0) == CHUNKS - 1)
+        for (ulong i = 16 * runs; i < num_rays; i++) {
+            t[i] = records[i].x, u[i] = records[i].y, v[i] = records[i].z;
+            triangle[i] = as_uint(records[i].w);
+        }
 }
 
 // Flat triangle numbers into (geometry, face within it); -1 where missed.

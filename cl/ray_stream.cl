@@ -139,24 +139,24 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
         uint number[RAYS];                                                                         \
         s.any = ANY;                                                                               \
         for (uint i = first; i < stop; i++) {                                                      \
-            const uint ray = active_ray(slots, num_slots, i, org_tnear, dir_tfar);                 \
+            const uint ray = ray_in_slot(slots, num_slots, i, org_tnear, dir_tfar);                \
             if (ray == INVALID)                                                                    \
                 continue;                                                                          \
-            set_single_ray(s.rays + c.rays, &scene, org_tnear[ray], dir_tfar[ray]);                \
-            number[c.rays++] = ray;                                                                \
+            SingleRay *r = s.rays + c.rays;                                                        \
+            set_single_ray(r, &scene, org_tnear[ray], dir_tfar[ray]);                              \
+            if (is_active(r))                                                                      \
+                number[c.rays++] = ray;                                                            \
+            else                                                                                   \
+                STORE(ray, 0.0f, 0.0f, 0.0f, INVALID);                                             \
         }                                                                                          \
         if (c.rays != 0)                                                                           \
             walk_stream(&s, c.rays, &tree, &c);                                                    \
         for (uint i = 0; i < c.rays; i++) {                                                        \
             const SingleRay *r = s.rays + i;                                                       \
-            const uint ray = number[i];                                                            \
-            if (r->hit.key != MISS) {                                                              \
-                STORE;                                                                             \
-            }                                                                                      \
+            STORE(number[i], r->frame.tfar, r->hit.u, r->hit.v, (uint)r->hit.key);                 \
         }                                                                                          \
         store_counts(&c, counts);                                                                  \
     }
 
-DEFINE_STREAM(intersect_stream, false, HITS_ARGUMENTS,
-              STORE_HIT(ray, r->frame.tfar, (uint)r->hit.key, r->hit.u, r->hit.v))
-DEFINE_STREAM(occlude_stream, true, global uchar *restrict blocked, blocked[ray] = 1)
+DEFINE_STREAM(intersect_stream, false, HIT_RECORDS, STORE_RECORD)
+DEFINE_STREAM(occlude_stream, true, BLOCKED_FLAGS, STORE_FLAG)

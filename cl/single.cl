@@ -18,20 +18,19 @@
         const Box scene = scene_box(nodes);                                                        \
         Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
         for (uint i = first; i < stop; i++) {                                                      \
-            const uint ray = active_ray(slots, num_slots, i, org_tnear, dir_tfar);                 \
+            const uint ray = ray_in_slot(slots, num_slots, i, org_tnear, dir_tfar);                \
             if (ray == INVALID)                                                                    \
                 continue;                                                                          \
             SingleRay r;                                                                           \
             set_single_ray(&r, &scene, org_tnear[ray], dir_tfar[ray]);                             \
-            walk(&r, &tree, 0, ANY, &c);                                                           \
-            c.rays++;                                                                              \
-            if (r.hit.key != MISS) {                                                               \
-                STORE;                                                                             \
+            if (is_active(&r)) {                                                                   \
+                walk(&r, &tree, 0, ANY, &c);                                                       \
+                c.rays++;                                                                          \
             }                                                                                      \
+            STORE(ray, r.frame.tfar, r.hit.u, r.hit.v, (uint)r.hit.key);                           \
         }                                                                                          \
         store_counts(&c, counts);                                                                  \
     }
 
-DEFINE_SINGLE(intersect_single, false, HITS_ARGUMENTS,
-              STORE_HIT(ray, r.frame.tfar, (uint)r.hit.key, r.hit.u, r.hit.v))
-DEFINE_SINGLE(occlude_single, true, global uchar *restrict blocked, blocked[ray] = 1)
+DEFINE_SINGLE(intersect_single, false, HIT_RECORDS, STORE_RECORD)
+DEFINE_SINGLE(occlude_single, true, BLOCKED_FLAGS, STORE_FLAG)

@@ -46,22 +46,24 @@ inline void store_counts(const Counts *c, global ulong *counts)
         global const float8 *restrict nodes, global const float8 *restrict leaves,                 \
         global ulong *restrict counts
 
-// The ray in a slot; INVALID where there is none, or none that can hit.
-inline uint active_ray(global const uint *slots, uint num_slots, uint i,
-                       global const float4 *org_tnear, global const float4 *dir_tfar)
+// The ray in a slot, INVALID where there is none.
+inline uint ray_in_slot(global const uint *slots, uint num_slots, uint i,
+                        global const float4 *org_tnear, global const float4 *dir_tfar)
 {
-    const uint ray = slots[i], soon = slots[MIN(i + AHEAD, num_slots - 1)];
+    const uint soon = slots[MIN(i + AHEAD, num_slots - 1)];
     PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));
     PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));
-    return ray != INVALID && dir_tfar[ray].w >= org_tnear[ray].w ? ray : INVALID;
+    return slots[i];
 }
 
-// Of the rays that hit; the arrays hold misses before.
-#define HITS_ARGUMENTS                                                                             \
-    global float *restrict hit_t, global uint *restrict hit_triangle, global float *restrict hit_u,\
-        global float *restrict hit_v
-#define STORE_HIT(ray, t, triangle, u, v)                                                          \
-    (hit_t[ray] = (t), hit_triangle[ray] = (triangle), hit_u[ray] = (u), hit_v[ray] = (v))
+// A query's result for one ray, where `hit` is its closest hit or a miss. Hits are records of t, u, v and the
+// triangle: sorted rays are scattered over memory, and each touches one cache line.
+#define HIT_RECORDS global float4 *restrict hits
+#define STORE_RECORD(ray, t, u, v, triangle)                                                       \
+    hits[ray] = (triangle) == INVALID ? (float4)(INFINITY, 0.0f, 0.0f, as_float(INVALID))          \
+                                      : (float4)(t, u, v, as_float(triangle))
+#define BLOCKED_FLAGS global uchar *restrict blocked
+#define STORE_FLAG(ray, t, u, v, triangle) blocked[ray] = (triangle) != INVALID
 
 // The closest hit so far: its key, and weights of its triangle's vertices.
 typedef struct {
@@ -83,8 +85,10 @@ inline void set_single_ray(SingleRay *r, const Box *scene, float4 org_tnear, flo
     r->hit.u = r->hit.v = 0.0f;
 }
 
+inline bool is_active(const SingleRay *r) { return r->frame.tfar >= r->frame.tnear; }
+
 // Whether one of a leaf's triangles is hit nearer than `hit`, which becomes that hit.
-INLINED bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *leaf, Counts *c)
+INLINE bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *leaf, Counts *c)
 {
     const uint x = frame->x, y = frame->y, z = frame->z;
     const Corner8 v0 = {leaf[x], leaf[y], leaf[z]};

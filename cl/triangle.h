@@ -18,9 +18,6 @@
 // A triangle is three float4 (v0, v1, v2, each with an unused w) in a row.
 #define TRIANGLE_FLOAT4S 3
 
-// A call would take vectors through memory.
-#define INLINED inline __attribute__((always_inline))
-
 // Corners are turned: x, y, z as a ray's frame sees them.
 #define DEFINE_CORNER(NAME, F)                                                                     \
     typedef struct {                                                                               \
@@ -72,7 +69,7 @@ DEFINE_TRIANGLE_HIT(TriangleHit16, float16, int16)
 // Edges only: whether a hit of the triangle's plane would lie inside. FRAME and CORNER in lanes of F; what is
 // not a vector yet is the same in all lanes.
 #define DEFINE_INSIDE_EDGES(NAME, SUFFIX, F, I, FMA, FRAME, CORNER)                                \
-    INLINED I NAME(const FRAME *r, CORNER v0, CORNER v1, CORNER v2, F *edges, F *depths)            \
+    INLINE I NAME(const FRAME *r, CORNER v0, CORNER v1, CORNER v2, F *edges, F *depths)            \
     {                                                                                              \
         const F ox = (F)(r->ox), oy = (F)(r->oy), oz = (F)(r->oz);                                 \
         const F shear_x = (F)(r->shear_x), shear_y = (F)(r->shear_y), scale = (F)(r->scale);       \
@@ -93,7 +90,7 @@ DEFINE_TRIANGLE_HIT(TriangleHit16, float16, int16)
 // first among the bit patterns. Weights before depths: edges times depths would leave the range of
 // float in large and tiny scenes.
 #define DEFINE_FINISH_HIT(NAME, F, I, FRAME, HIT)                                                  \
-    INLINED HIT NAME(const FRAME *r, I inside, const F *edges, const F *depths)                     \
+    INLINE HIT NAME(const FRAME *r, I inside, const F *edges, const F *depths)                     \
     {                                                                                              \
         HIT h;                                                                                     \
         const F det = edges[0] + edges[1] + edges[2];                                              \
@@ -152,7 +149,7 @@ DEFINE_FINISH_HIT(finish_hit_run, float16, int16, RayFrame, TriangleHit16)
     }                                                                                              \
                                                                                                    \
     /* One triangle for all: component k of corner c at v[c * corner + k * component]. */          \
-    INLINED I inside_edges_rays##W(const RayFrame##W *r, global const float *v, uint corner,        \
+    INLINE I inside_edges_rays##W(const RayFrame##W *r, global const float *v, uint corner,        \
                                   uint component, F *edges, F *depths)                             \
     {                                                                                              \
         global const float *v1 = v + corner, *v2 = v + 2 * corner;                                 \

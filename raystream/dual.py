@@ -14,7 +14,7 @@ import pyopencl.array as cla
 from raystream.checks import check_choice
 from raystream.errors import MemoryLimitError
 from raystream.hash import DEFAULT_HASH
-from raystream.intersect import HitStream, not_blocked
+from raystream.intersect import HitStream
 from raystream.order import leaf_slots, sorted_slots
 from raystream.statistics import TRAVERSAL, Statistics
 from raystream.tree import BUILDERS, SceneTree
@@ -128,20 +128,21 @@ class DualTracer:
 
     def intersect(self, rays):
         """Closest hits of `rays`; returns (HitStream, Statistics)."""
-        hits = HitStream.misses(self.session, len(rays))
-        return hits, self._trace("intersect", rays, hits.t, hits.triangle, hits.u, hits.v)
+        records = self.session.empty((len(rays), 4), np.float32)
+        statistics = self._trace("intersect", rays, records)
+        return HitStream.unpack(self.session, records), statistics
 
     def occluded(self, rays):
         """Whether anything lies in each ray's segment; returns (uint8 Array, Statistics)."""
-        blocked = not_blocked(self.session, len(rays))
+        blocked = self.session.empty(len(rays), np.uint8)
         return blocked, self._trace("occlude", rays, blocked)
 
-    def _trace(self, query, rays, *results):
+    def _trace(self, query, rays, result):
         self.tree(len(rays))
-        plan = self._plan(query, rays, results)
-        return self._statistics(self._run(query, plan, rays, results))
+        plan = self._plan(query, rays, result)
+        return self._statistics(self._run(query, plan, rays, result))
 
-    def _plan(self, query, rays, results):
+    def _plan(self, query, rays, result):
         """How to trace these rays, and in which order.
 
         A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
@@ -154,7 +155,7 @@ class DualTracer:
             if len(rays) < _FEW_RAYS:
                 return _Plan("single", given)
             plan = _Plan("bundle", given)
-            if self._coherence(query, plan, rays, results).visits < _VISITS_WORTH_A_SORT:
+            if self._coherence(query, plan, rays, result).visits < _VISITS_WORTH_A_SORT:
                 return plan
         elif rays.size is not None:
             return _Plan(self._traversal, given)
@@ -162,15 +163,15 @@ class DualTracer:
         if self._traversal != "auto":
             return _Plan(self._traversal, hashed)
         plan = _Plan("bundle", hashed)
-        shared = self._coherence(query, plan, rays, results).shared
+        shared = self._coherence(query, plan, rays, result).shared
         return plan if shared >= _SHARED_BY_BUNDLE else _Plan("stream", hashed)
 
-    def _coherence(self, query, plan, rays, results):
-        counts = self._run(query, plan, rays, results, most=_SAMPLES)
+    def _coherence(self, query, plan, rays, result):
+        counts = self._run(query, plan, rays, result, most=_SAMPLES)
         visits = counts["nodes"] + counts["leaves"]
         return _Coherence(visits / max(1, counts["rays"]), counts["boxes"] / max(1, visits))
 
-    def _run(self, query, plan, rays, results, most=None):
+    def _run(self, query, plan, rays, result, most=None):
         """Trace the rays, or up to `most` work-items' spread evenly; returns the counts."""
         size, num_slots = _RAYS[plan.traversal], plan.slots.shape[0]
         groups = -(-num_slots // size)
@@ -189,7 +190,7 @@ class DualTracer:
             tree.nodes,
             tree.leaves,
             counts,
-            *results,
+            result,
         )
         sums = (int(x) for x in counts.get().sum(axis=0, dtype=np.uint64))
         return dict(zip(_COUNTS, sums, strict=True))

@@ -39,10 +39,12 @@ class HitStream:
         return cls(*(session.empty(count, t) for t in types))
 
     @classmethod
-    def misses(cls, session, count):
-        """Misses of `count` rays."""
+    def unpack(cls, session, records):
+        """Hits of records, (n, 4) float32: t, u, v and the triangle's bits."""
+        count = records.shape[0]
         hits = cls.empty(session, count)
-        _launch(session, "miss_all", np.uint32(count), hits.t, hits.triangle, hits.u, hits.v)
+        fields = hits.t, hits.triangle, hits.u, hits.v
+        _launch(session, "unpack_hits", np.uint32(count), records, *fields)
         return hits
 
 

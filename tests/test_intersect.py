@@ -1,4 +1,4 @@
-"""What all tracers share of hits: misses, and the numbers of meshes and faces."""
+"""What all tracers share of hits: their fields, and the numbers of meshes and faces."""
 
 import numpy as np
 import pytest
@@ -11,10 +11,15 @@ SIZES = [0, 1, 15, 16, 17, 1009, 20_011]
 
 
 @pytest.mark.parametrize("count", SIZES)
-def test_misses(count, session):
-    hits = intersect.HitStream.misses(session, count)
-    for field, missed in ((hits.t, np.inf), (hits.triangle, 0xFFFFFFFF), (hits.u, 0), (hits.v, 0)):
-        np.testing.assert_array_equal(field.get(), np.full(count, missed, field.dtype))
+def test_hits_of_records(count, path, rng):
+    session = device.session()
+    records = rng.random((count, 4), np.float32)
+    records[:, 3] = np.arange(count, dtype=np.uint32)[::-1].view(np.float32)
+    records[::3, 3] = np.uint32(0xFFFFFFFF).view(np.float32)
+    hits = intersect.HitStream.unpack(session, session.upload("test", records))
+    for k, field in enumerate((hits.t, hits.u, hits.v)):
+        np.testing.assert_array_equal(field.get(), records[:, k])
+    np.testing.assert_array_equal(hits.triangle.get(), records[:, 3].view(np.uint32))
 
 
 @pytest.mark.parametrize("count", SIZES)
@@ -25,7 +30,7 @@ def test_numbers_of_meshes_and_faces(faces, count, path, rng):
     geometry = Geometry(session, rs.Scene(meshes))
     triangle = rng.integers(0, sum(faces), count).astype(np.uint32)
     triangle[rng.random(count) < 0.3] = 0xFFFFFFFF
-    hits = intersect.HitStream.misses(session, count)
+    hits = intersect.HitStream.empty(session, count)
     hits.triangle = session.upload("test", triangle)
     geom_id, prim_id = intersect.split_ids(session, hits, geometry)
     meshes_of = np.repeat(np.arange(len(faces)), faces)
