@@ -136,8 +136,15 @@ kernel void resolve_hits(const uint num_rays, global const ulong *restrict close
 kernel void miss_all(const uint num_rays, global float *restrict t, global uint *restrict triangle,
                      global float *restrict u, global float *restrict v)
 {
-    for (ulong i = chunk_begin(num_rays), end = chunk_end(num_rays); i < end; i++)
-        t[i] = INFINITY, triangle[i] = INVALID, u[i] = 0.0f, v[i] = 0.0f;
+    const ulong begin = chunk_begin(num_rays), end = chunk_end(num_rays);
+    for (ulong i = begin; i < end; i++)
+        t[i] = INFINITY;
+    for (ulong i = begin; i < end; i++)
+        triangle[i] = INVALID;
+    for (ulong i = begin; i < end; i++)
+        u[i] = 0.0f;
+    for (ulong i = begin; i < end; i++)
+        v[i] = 0.0f;
 }
 
 // Flat triangle numbers into (geometry, face within it); -1 where missed.
@@ -155,5 +162,17 @@ kernel void split_ids(const uint num_rays, const uint num_meshes,
         }
         geom_id[i] = (int)mesh;
         prim_id[i] = (int)(id - first);
+    }
+}
+
+// One work-item: sums of the columns of rows of counts.
+kernel void sum_counts(const uint rows, const uint columns, global const ulong *restrict counts,
+                       global ulong *restrict sums)
+{
+    for (uint k = 0; k < columns; k++) {
+        ulong sum = 0;
+        for (uint row = 0; row < rows; row++)
+            sum += counts[row * columns + k];
+        sums[k] = sum;
     }
 }
