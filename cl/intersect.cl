@@ -174,3 +174,15 @@ kernel void split_ids(const uint num_rays, const uint num_meshes,
         prim_id[i] = (int)(id - first);
     }
 }
+
+// One work-item: sums of the columns of rows of counts.
+kernel void sum_counts(const uint rows, const uint columns, global const ulong *restrict counts,
+                       global ulong *restrict sums)
+{
+    for (uint k = 0; k < columns; k++) {
+        ulong sum = 0;
+        for (uint row = 0; row < rows; row++)
+            sum += counts[row * columns + k];
+        sums[k] = sum;
+    }
+}

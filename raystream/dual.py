@@ -14,7 +14,7 @@ import pyopencl.array as cla
 from raystream.checks import check_choice
 from raystream.errors import MemoryLimitError
 from raystream.hash import DEFAULT_HASH
-from raystream.intersect import HitStream
+from raystream.intersect import HitStream, sum_counts
 from raystream.order import leaf_slots, sorted_slots
 from raystream.statistics import TRAVERSAL, Statistics
 from raystream.tree import BUILDERS, SceneTree
@@ -192,8 +192,7 @@ class DualTracer:
             counts,
             result,
         )
-        sums = (int(x) for x in counts.get().sum(axis=0, dtype=np.uint64))
-        return dict(zip(_COUNTS, sums, strict=True))
+        return dict(zip(_COUNTS, sum_counts(self.session, counts), strict=True))
 
     def _statistics(self, counts):
         levels = [

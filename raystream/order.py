@@ -10,6 +10,7 @@ from raystream.statistics import RAY_CREATION, SORTING
 
 _INVALID = np.uint32(0xFFFFFFFF)
 _TILE = 8
+_DIGIT_BITS = 12  # neighbours in the stream have close hashes but for rays of random starts
 
 
 def screen_slots(width, height):
@@ -107,4 +108,4 @@ def sorted_slots(session, rays, slots, name):
     """
     keys, _ = hash.hash_rays(session, rays, slots, name)
     with session.clock.under(SORTING):
-        return sort_by_key(session, keys, slots, hash.BITS[name])[1]
+        return sort_by_key(session, keys, slots, hash.BITS[name], digit_bits=_DIGIT_BITS)[1]
