@@ -103,6 +103,28 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
     return top;
 }
 
+// Tests first, without a branch, then what the few go on with that have a triangle around them.
+inline void test_list(Stream *s, List list, global const float8 *leaf, Counts *c)
+{
+    const uint *ids = s->ids + list.begin;
+    LeafTest tests[16];
+    for (uint i = 0; i < list.count; i += 16) {
+        const uint count = MIN(list.count - i, 16u);
+        uint inside = 0;
+        for (uint k = 0; k < count; k++)
+            inside |= (uint)test_edges(&s->rays[ids[i + k]].frame, leaf, tests + k) << k;
+        for (; inside != 0; inside &= inside - 1) {
+            const uint k = LOWEST(inside);
+            SingleRay *r = s->rays + ids[i + k];
+            if (!(s->any && r->hit.key != MISS)
+                && finish_leaf(&r->frame, tests + k, &r->hit, leaf, c))
+                shorten_ray(r);
+        }
+    }
+    c->leaves += list.count;
+    c->tests += TREE_WIDTH * list.count;
+}
+
 inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
 {
     List stack[TREE_STACK];
@@ -114,11 +136,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
         const List list = stack[--top];
         if (list.node & LEAF) {
             global const float8 *leaf = tree->leaves + (ulong)(list.node & ~LEAF) * LEAF_ROWS;
-            for (uint i = 0; i < list.count; i++) {
-                SingleRay *r = s->rays + s->ids[list.begin + i];
-                if (!(s->any && r->hit.key != MISS))
-                    visit_leaf(r, leaf, c);
-            }
+            test_list(s, list, leaf, c);
         } else if (list.count <= FEW || list.begin + 9 * list.count > ROOM) {
             finish_list(s, tree, list, c);
         } else {

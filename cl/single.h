@@ -87,20 +87,28 @@ inline void set_single_ray(SingleRay *r, const Box *scene, float4 org_tnear, flo
 
 inline bool is_active(const SingleRay *r) { return r->frame.tfar >= r->frame.tnear; }
 
-// Whether one of a leaf's triangles is hit nearer than `hit`, which becomes that hit.
-INLINE bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *leaf, Counts *c)
+// A ray's edges and depths of a leaf's triangles.
+typedef struct {
+    float8 edges[3], depths[3];
+    int8 inside;
+} LeafTest;
+
+// Whether the ray's line is inside a triangle.
+INLINE bool test_edges(const RayFrame *frame, global const float8 *leaf, LeafTest *test)
 {
     const uint x = frame->x, y = frame->y, z = frame->z;
     const Corner8 v0 = {leaf[x], leaf[y], leaf[z]};
     const Corner8 v1 = {leaf[3 + x], leaf[3 + y], leaf[3 + z]};
     const Corner8 v2 = {leaf[6 + x], leaf[6 + y], leaf[6 + z]};
-    float8 edges[3], depths[3];
-    const int8 inside = inside_edges8(frame, v0, v1, v2, edges, depths);
-    c->leaves++;
-    c->tests += TREE_WIDTH;
-    if (MASK8(inside) == 0)
-        return false;
-    const TriangleHit8 h = finish_hit8(frame, inside, edges, depths);
+    test->inside = inside_edges8(frame, v0, v1, v2, test->edges, test->depths);
+    return MASK8(test->inside) != 0;
+}
+
+// Whether there is a hit nearer than `hit`, which becomes that hit.
+INLINE bool finish_leaf(const RayFrame *frame, const LeafTest *test, Closest *hit,
+                        global const float8 *leaf, Counts *c)
+{
+    const TriangleHit8 h = finish_hit8(frame, test->inside, test->edges, test->depths);
     uint mask = MASK8(h.hit);
     if (mask == 0)
         return false;
@@ -123,15 +131,28 @@ INLINE bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *
     return hit->key != before;
 }
 
+// Both.
+INLINE bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *leaf, Counts *c)
+{
+    LeafTest test;
+    c->leaves++;
+    c->tests += TREE_WIDTH;
+    return test_edges(frame, leaf, &test) && finish_leaf(frame, &test, hit, leaf, c);
+}
+
 inline float distance_of(const Closest *hit) { return as_float((uint)(hit->key >> 32)); }
+
+// Equal distances still hit, and are still entered.
+inline void shorten_ray(SingleRay *r)
+{
+    r->frame.tfar = distance_of(&r->hit);
+    r->box.end = r->frame.tfar * r->box.per_t * OUTWARDS;
+}
 
 inline void visit_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
 {
-    if (!test_leaf(&r->frame, &r->hit, leaf, c))
-        return;
-    // Equal distances still hit, and are still entered.
-    r->frame.tfar = distance_of(&r->hit);
-    r->box.end = r->frame.tfar * r->box.per_t * OUTWARDS;
+    if (test_leaf(&r->frame, &r->hit, leaf, c))
+        shorten_ray(r);
 }
 
 // A child and where it is entered, ordered by the latter: s >= 0, so its bits sort like its value.
@@ -155,23 +176,28 @@ inline void walk(SingleRay *r, const Tree *tree, uint node, bool any, Counts *c)
             c->nodes++;
             c->box_tests += TREE_WIDTH;
             c->boxes += COUNT16(mask);
-            if (mask != 0 && (mask & (mask - 1)) == 0) {
-                node = children[LOWEST(mask)];
-                continue;
-            }
             if (mask != 0) {
+                const uint first = LOWEST(mask);
+                mask &= mask - 1;
+                if (mask == 0) {
+                    node = children[first];
+                    continue;
+                }
                 float distance[8] __attribute__((aligned(32)));
                 *(float8 *)distance = enter;
+                ulong nearest = entry(distance[first], children[first]);
                 const uint base = top;
                 for (; mask != 0; mask &= mask - 1) {
                     const uint k = LOWEST(mask);
                     const ulong child = entry(distance[k], children[k]);
+                    const ulong farther = MAX(child, nearest);
+                    nearest = MIN(child, nearest);
                     uint place = top++;
-                    for (; place > base && stack[place - 1] < child; place--)
+                    for (; place > base && stack[place - 1] < farther; place--)
                         stack[place] = stack[place - 1];
-                    stack[place] = child;
+                    stack[place] = farther;
                 }
-                node = (uint)stack[--top];
+                node = (uint)nearest;
                 continue;
             }
         }

@@ -37,7 +37,7 @@ _RAYS_OF_QUALITY = 3
 # fast as bundles where fewer did.
 _FEW_RAYS = 8192
 _SAMPLES = 32
-_VISITS_WORTH_A_SORT = 1.5
+_VISITS_WORTH_A_SORT = 1.0
 _SHARED_BY_BUNDLE = 4.75
 
 

@@ -271,7 +271,7 @@ def test_auto_takes_the_traversal_that_suits_the_rays(rng, session):
     scene = triangle_soup(rng, 20_000, size=0.02)
     scattered = from_numpy(session, *random_rays(rng, 20_000), 0.0, np.inf)
     few = from_numpy(session, *random_rays(rng, 500), 0.0, np.inf)
-    cases = (("single", few), ("bundle", grid_of_rays(128, 128)), ("stream", scattered))
+    cases = (("single", few), ("bundle", grid_of_rays(256, 256)), ("stream", scattered))
     for traversal, rays in cases:
         counts = []
         for choice in ("auto", *TRAVERSALS[:3]):
