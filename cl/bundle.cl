@@ -5,7 +5,7 @@
 // enclose all of them: one interval test tells which of a node's eight children any ray may enter,
 // and where the first one enters. Children wait on a stack, nearest on top, with the rays that
 // entered their parent. When a child is popped each of these rays is tested against its box alone, up
-// to the ray's hit so far. Where few rays of a group are left they finish that child as single rays.
+// to the ray's hit so far, unless the intervals say that all enter. Where few rays of a group are left they finish that child as single rays.
 // In a leaf, triangles whose box the intervals miss are dropped, the others are tested with sixteen
 // rays at once.
 //
@@ -31,7 +31,8 @@ typedef struct {
 // near (far) of the two ends of `inverse`. An axis along which not all go the same way says nothing.
 typedef struct {
     float inverse[3][2], near[3][2], far[3][2];
-    bool falls[3], says[3];
+    bool falls[3], says[3], agrees;
+    uint low_row[3]; // as in BoxRay
     float begin, end;
 } Interval;
 
@@ -98,6 +99,7 @@ inline Interval interval_of(const Bounds *b)
         const bool falls = v.falls[k] = b->high_inverse[k] < 0.0f;
         const float low = b->low_org[k] - b->slack, high = b->high_org[k] + b->slack;
         v.says[k] = falls || b->low_inverse[k] > 0.0f;
+        v.low_row[k] = falls ? 3 + k : k;
         v.inverse[k][0] = b->low_inverse[k];
         v.inverse[k][1] = b->high_inverse[k];
         for (uint end = 0; end < 2; end++) {
@@ -105,6 +107,7 @@ inline Interval interval_of(const Bounds *b)
             v.far[k][end] = -(falls ? high : low) * v.inverse[k][end];
         }
     }
+    v.agrees = v.says[0] && v.says[1] && v.says[2];
     v.begin = b->begin;
     v.end = b->end;
     return v;
@@ -115,41 +118,53 @@ typedef struct {
     float8 low[3], high[3];
 } Boxes;
 
-// Bit k: some ray may enter box k; at (*enter)[k] at the earliest.
-inline uint enter_boxes(const Interval *v, const Boxes *boxes, float8 *enter)
+// Bit k: some ray may enter box k; at (*enter)[k] at the earliest. In `all`, bit k: every ray whose segment is
+// that of the bundle enters.
+INLINE uint enter_boxes(const Interval *v, const Boxes *boxes, float8 *enter, uint *all)
 {
-    float8 a = v->begin, b = v->end;
+    float8 a = v->begin, b = v->end, last_in = v->begin, first_out = v->end;
     for (uint k = 0; k < 3; k++) {
         if (!v->says[k])
             continue;
         const float8 first = v->falls[k] ? boxes->high[k] : boxes->low[k];
         const float8 last = v->falls[k] ? boxes->low[k] : boxes->high[k];
         const float8 i0 = v->inverse[k][0], i1 = v->inverse[k][1];
-        const float8 near0 = FMA8(first, i0, (float8)(v->near[k][0]));
-        const float8 near1 = FMA8(first, i1, (float8)(v->near[k][1]));
-        const float8 far0 = FMA8(last, i0, (float8)(v->far[k][0]));
-        const float8 far1 = FMA8(last, i1, (float8)(v->far[k][1]));
-        const float8 near = near0 < near1 ? near0 : near1, far = far0 > far1 ? far0 : far1;
-        a = near > a ? near : a;
-        b = far < b ? far : b;
+        const float8 near0 = v->near[k][0], near1 = v->near[k][1];
+        const float8 far0 = v->far[k][0], far1 = v->far[k][1];
+        a = larger8(a, smaller8(FMA8(first, i0, near0), FMA8(first, i1, near1)));
+        b = smaller8(b, larger8(FMA8(last, i0, far0), FMA8(last, i1, far1)));
+        last_in = larger8(last_in, larger8(FMA8(first, i0, far0), FMA8(first, i1, far1)));
+        first_out = smaller8(first_out, smaller8(FMA8(last, i0, near0), FMA8(last, i1, near1)));
     }
     *enter = a;
+    *all = v->agrees ? MASK8(last_in <= first_out) : 0;
     return MASK8(a <= b);
 }
 
-// Rays of a group that enter a box: six rows of eight boxes, the box in the first lane.
-inline uint rays_entering(const Group *g, const Interval *v, global const float *box)
+// Rays of a group that enter a box, where all of the bundle go the same way along every axis: the planes at
+// which they enter and leave.
+INLINE uint rays_entering(const Group *g, const float *first, const float *last)
 {
     float16 a = g->begin, b = g->end;
+#pragma unroll
     for (uint k = 0; k < 3; k++) {
-        const float low = box[8 * k], high = box[8 * (3 + k)];
-        float16 first = v->falls[k] ? high : low, last = v->falls[k] ? low : high;
-        if (!v->says[k]) {
-            first = g->falls[k] ? (float16)high : (float16)low;
-            last = g->falls[k] ? (float16)low : (float16)high;
-        }
-        const float16 near = FMA16(first, g->inverse[k], g->near[k]);
-        const float16 far = FMA16(last, g->inverse[k], g->far[k]);
+        const float16 near = FMA16((float16)first[k], g->inverse[k], g->near[k]);
+        const float16 far = FMA16((float16)last[k], g->inverse[k], g->far[k]);
+        a = near > a ? near : a;
+        b = far < b ? far : b;
+    }
+    return MASK16(a <= b);
+}
+
+// The same, where they do not: six rows of eight boxes, the box in the first lane.
+INLINE uint mixed_entering(const Group *g, global const float *box)
+{
+    float16 a = g->begin, b = g->end;
+#pragma unroll
+    for (uint k = 0; k < 3; k++) {
+        const float16 low = box[8 * k], high = box[8 * (3 + k)];
+        const float16 near = FMA16(g->falls[k] ? high : low, g->inverse[k], g->near[k]);
+        const float16 far = FMA16(g->falls[k] ? low : high, g->inverse[k], g->far[k]);
         a = near > a ? near : a;
         b = far < b ? far : b;
     }
@@ -284,8 +299,10 @@ inline void test_leaf_bundle(Bundle *b, ulong mask, const Tree *tree, uint node,
         boxes.low[k] = low < v2 ? low : v2;
         boxes.high[k] = high > v2 ? high : v2;
     }
-    float8 unused;
-    const uint triangles = enter_boxes(&b->interval, &boxes, &unused) & MASK8(leaf[0] == leaf[0]);
+    float8 enter;
+    uint all;
+    const uint triangles
+        = enter_boxes(&b->interval, &boxes, &enter, &all) & MASK8(leaf[0] == leaf[0]);
     const uint count = COUNT16(triangles);
     c->leaves++;
     c->leaf_tests += TREE_WIDTH;
@@ -314,13 +331,20 @@ inline ulong enter_child(Bundle *b, ulong mask, const Tree *tree, global const f
                          Counts *c)
 {
     ulong entered = 0;
-    for (uint g = 0; g < GROUPS; g++) {
-        const uint before = rays_of(mask, g);
-        if (before == 0)
-            continue;
-        const uint rays = rays_entering(b->groups + g, &b->interval, box) & before;
-        entered |= (ulong)rays << 16 * g;
+    if (b->interval.agrees) {
+        const uint *rows = b->interval.low_row;
+        const float first[3] = {box[8 * rows[0]], box[8 * rows[1]], box[8 * rows[2]]};
+        const float last[3] = {box[8 * (3 - rows[0])], box[8 * (5 - rows[1])], box[8 * (7 - rows[2])]};
+#pragma unroll
+        for (uint g = 0; g < GROUPS; g++)
+            if (rays_of(mask, g))
+                entered |= (ulong)rays_entering(b->groups + g, first, last) << 16 * g;
+    } else {
+        for (uint g = 0; g < GROUPS; g++)
+            if (rays_of(mask, g))
+                entered |= (ulong)mixed_entering(b->groups + g, box) << 16 * g;
     }
+    entered &= mask;
     const uint count = COUNT64(entered);
     c->box_tests += COUNT64(mask);
     c->boxes += count;
@@ -334,6 +358,11 @@ inline ulong enter_child(Bundle *b, ulong mask, const Tree *tree, global const f
     return 0;
 }
 
+// Box k of a node, and whether all rays enter it.
+#define BOX(node, k, all) ((node) * (2 * TREE_WIDTH) + 2 * (k) + (all))
+#define NODE_OF(box) ((box) / (2 * TREE_WIDTH))
+#define CHILD_OF(box) ((box) / 2 % TREE_WIDTH)
+
 inline void walk_bundle(Bundle *b, const Tree *tree, Counts *c)
 {
     ulong stack[TREE_STACK], waiting[TREE_STACK];
@@ -343,14 +372,15 @@ inline void walk_bundle(Bundle *b, const Tree *tree, Counts *c)
         global const float8 *rows = tree->nodes + (ulong)node * TREE_ROWS;
         const Boxes boxes = {{rows[0], rows[1], rows[2]}, {rows[3], rows[4], rows[5]}};
         float distance[8] __attribute__((aligned(32)));
-        const uint mask = enter_boxes(&b->interval, &boxes, (float8 *)distance);
+        uint all;
+        const uint mask = enter_boxes(&b->interval, &boxes, (float8 *)distance, &all);
         c->nodes++;
         c->box_tests += TREE_WIDTH;
         c->boxes += COUNT16(mask);
         const uint base = top;
         for (uint left = mask; left != 0; left &= left - 1) {
             const uint k = LOWEST(left);
-            const ulong box = entry(distance[k], TREE_WIDTH * node + k);
+            const ulong box = entry(distance[k], BOX(node, k, all >> k & 1));
             prefetch_child(tree, ((global const uint *)(rows + TREE_CHILD_ROW))[k]);
             uint place = top;
             for (; place > base && stack[place - 1] < box; place--)
@@ -363,13 +393,19 @@ inline void walk_bundle(Bundle *b, const Tree *tree, Counts *c)
             if (top == 0)
                 return;
             const ulong box = stack[--top];
-            const ulong looking = waiting[top] & b->open;
-            if (looking == 0 || as_float((uint)(box >> 32)) > b->interval.end)
+            rays = waiting[top] & b->open;
+            if (rays == 0)
                 continue;
-            const uint k = (uint)box % TREE_WIDTH;
-            rows = tree->nodes + (ulong)((uint)box / TREE_WIDTH) * TREE_ROWS;
+            if (as_float((uint)(box >> 32)) > b->interval.end) {
+                rays = 0;
+                continue;
+            }
+            const uint k = CHILD_OF((uint)box);
+            rows = tree->nodes + (ulong)NODE_OF((uint)box) * TREE_ROWS;
             node = ((global const uint *)(rows + TREE_CHILD_ROW))[k];
-            rays = enter_child(b, looking, tree, (global const float *)rows + k, node, c);
+            if ((box & 1) && !(node & LEAF))
+                break;
+            rays = enter_child(b, rays, tree, (global const float *)rows + k, node, c);
             if (rays != 0 && (node & LEAF)) {
                 test_leaf_bundle(b, rays, tree, node, c);
                 rays = 0;

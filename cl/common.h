@@ -32,6 +32,10 @@ inline float16 magnitude(float16 x) { return as_float16(as_int16(x) & 0x7fffffff
 
 inline float16 larger(float16 a, float16 b) { return a > b ? a : b; }
 
+inline float8 larger8(float8 a, float8 b) { return a > b ? a : b; }
+
+inline float8 smaller8(float8 a, float8 b) { return a < b ? a : b; }
+
 inline float size_of(float v) { return v < 0.0f ? -v : v; }
 
 inline float4 size_of4(float4 v) { return v < 0.0f ? -v : v; }
