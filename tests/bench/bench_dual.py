@@ -41,7 +41,7 @@ SCENES = ("bunny", "soup", "sponza", "conference", "office", "kitchen", "maple",
 KINDS = ("primary", "mirror", "bumpy", "shadow", "random")
 OPPONENTS = ("open3d", "mitsuba")  # the ratio is to the better of these
 ROUNDS = 5
-_PAUSE = 0.02  # seconds until the threads of the one before have stopped looking for work
+_PAUSE = 0.2  # seconds until the threads of the one before have stopped looking for work
 _BUMPINESS = 0.35  # of a normal of length 1
 _OFF_SURFACE = 1e-4  # of the scene's size: where secondary rays start
 
@@ -300,15 +300,20 @@ class _Answer:
 
 
 def in_turn(runners, call, rounds=ROUNDS):
-    """Median seconds of `call(name, round)` for each, one after the other in every round."""
+    """Median seconds of `call(name, step)` for each, one after the other in every round.
+
+    Each runs twice in a row and the second is timed, as in a loop over frames: sleeping threads and
+    caches full of another's data are not what is compared.
+    """
     seconds = {name: [] for name in runners}
-    for turn in range(rounds + 1):
+    for turn in range(rounds):
         for name in runners:
             time.sleep(_PAUSE)
+            call(name, 2 * turn)
             start = time.perf_counter()
-            call(name, turn)
+            call(name, 2 * turn + 1)
             seconds[name].append(time.perf_counter() - start)
-    return {name: float(np.median(s[1:])) for name, s in seconds.items()}  # the first warms up
+    return {name: float(np.median(s)) for name, s in seconds.items()}
 
 
 def flat(scene):
@@ -336,10 +341,10 @@ def measure(name, folder, kinds, counts, threads):
             agreeing = ", ".join(f"{key} {share:.5f}" for key, share in shares.items())
             print(f"{name} {kind} {count}: {agreement}; equal: {agreeing}")
 
-            def frame(key, turn, rays=rays, any_hit=any_hit):
-                runners[key].frame(frames[turn % 2], *rays, any_hit)
+            def frame(key, step, rays=rays, any_hit=any_hit):
+                runners[key].frame(frames[step % 2], *rays, any_hit)
 
-            def trace(key, turn, prepared=prepared, any_hit=any_hit):
+            def trace(key, step, prepared=prepared, any_hit=any_hit):
                 runners[key].trace(prepared[key], any_hit)
 
             for question, call in (("frame", frame), ("trace", trace)):
