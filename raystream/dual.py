@@ -30,11 +30,11 @@ _COUNTS = (
 # The better builder takes 75 ns more for each triangle and saves 25 ns of a ray (medians of five
 # scenes and five kinds of rays, 34,000 to 331,000 triangles, two cores).
 _RAYS_OF_QUALITY = 3
-# See `DualTracer._choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from a
-# light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a bundle,
-# streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of sorting and
-# the better of bundles and streams. Where more did, sorted bundles shared a visit among some 30 of
-# their 64 rays; sorting took as long as bundles for 0.45 visits of each ray and 40,000 visits.
+# See `DualTracer._choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from
+# a light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a
+# bundle, streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of
+# sorting and the better of bundles and streams. Where more did, sorted bundles shared a visit among
+# some 30 of their 64 rays; sorting took as long as bundles for 0.45 visits of each ray and 40,000.
 _FEW_RAYS = 8192
 _SAMPLES = 32
 _SHARED_BY_BUNDLE = 3.6
