@@ -3,7 +3,7 @@
 The scene hierarchy is `raystream.tree`'s. Rays walk it alone (cl/single.cl), as bundles of 64
 (cl/bundle.cl) or as streams of thousands (cl/ray_stream.cl); all three find the hits of `brute`,
 bit for bit. Which of them is faster depends on how many rays of a bundle share a visit of a node:
-see `DualTracer._plan`.
+see `DualTracer._choice`.
 """
 
 import dataclasses
@@ -30,15 +30,16 @@ _COUNTS = (
 # The better builder takes 75 ns more for each triangle and saves 25 ns of a ray (medians of five
 # scenes and five kinds of rays, 34,000 to 331,000 triangles, two cores).
 _RAYS_OF_QUALITY = 3
-# See `DualTracer._plan`. Measured with five scenes, rays from a camera, a light and mirrors, two
-# cores: sorting 262,144 rays lost 1 to 8 ms where bundles had made 0.2 to 1.0 visits per ray,
-# gained nothing at 1.3, and saved 2 to 58 ms from 2.3 on (but for one case). Bundles were 1.1 times
-# as fast as streams and more where at least 4.8 rays shared a visit, streams 1.1 to 1.8 times as
-# fast as bundles where fewer did.
+# See `DualTracer._choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from
+# a light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a
+# bundle, streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of
+# sorting and the better of bundles and streams. Where more did, sorted bundles shared a visit among
+# some 30 of their 64 rays; sorting took as long as bundles for 0.45 visits of each ray and 40,000.
 _FEW_RAYS = 8192
 _SAMPLES = 32
-_VISITS_WORTH_A_SORT = 1.0
-_SHARED_BY_BUNDLE = 4.75
+_SHARED_BY_BUNDLE = 3.6
+_SHARED_WHEN_SORTED = 30
+_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.45, 40_000
 
 
 @dataclasses.dataclass
@@ -55,6 +56,11 @@ class _Coherence:
 
     visits: float
     shared: float
+
+    def worth_a_sort(self, num_rays):
+        """Whether so many rays are likely to save more visits by being sorted than it costs."""
+        saved = self.visits * (1 - self.shared / _SHARED_WHEN_SORTED)
+        return saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
 
 
 class DualTracer:
@@ -143,28 +149,29 @@ class DualTracer:
         return self._statistics(self._run(query, plan, rays, result))
 
     def _plan(self, query, rays, result):
-        """How to trace these rays, and in which order.
+        """How to trace these rays, and in which order: only bundles gain by one."""
+        given, traversal = leaf_slots(self.session, rays), self._traversal
+        sort = traversal == "bundle" and rays.size is None
+        if traversal == "auto":
+            traversal, sort = self._choice(query, rays, given, result)
+        return _Plan(
+            traversal, sorted_slots(self.session, rays, given, DEFAULT_HASH) if sort else given
+        )
+
+    def _choice(self, query, rays, given, result):
+        """The traversal that suits the rays, and whether they should be sorted for it.
 
         A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
-        stream costs what each ray's nodes and leaves cost. So it matters how many visits bundles
-        make, and how many rays share one: a few bundles, spread over all, are traced to see. First
-        in the given order, which may be good enough to save the sorting.
+        stream costs what each ray's nodes and leaves cost, in whatever order its rays are. So it
+        matters how many visits bundles make, and how many rays share one: a few bundles in the
+        given order, spread over all, are traced to see.
         """
-        given = leaf_slots(self.session, rays)
-        if self._traversal == "auto":
-            if len(rays) < _FEW_RAYS:
-                return _Plan("single", given)
-            plan = _Plan("bundle", given)
-            if self._coherence(query, plan, rays, result).visits < _VISITS_WORTH_A_SORT:
-                return plan
-        elif rays.size is not None:
-            return _Plan(self._traversal, given)
-        hashed = sorted_slots(self.session, rays, given, DEFAULT_HASH)
-        if self._traversal != "auto":
-            return _Plan(self._traversal, hashed)
-        plan = _Plan("bundle", hashed)
-        shared = self._coherence(query, plan, rays, result).shared
-        return plan if shared >= _SHARED_BY_BUNDLE else _Plan("stream", hashed)
+        if len(rays) < _FEW_RAYS:
+            return "single", False
+        coherence = self._coherence(query, _Plan("bundle", given), rays, result)
+        if coherence.shared < _SHARED_BY_BUNDLE:
+            return "stream", False
+        return "bundle", coherence.worth_a_sort(len(rays))
 
     def _coherence(self, query, plan, rays, result):
         counts = self._run(query, plan, rays, result, most=_SAMPLES)

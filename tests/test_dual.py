@@ -283,6 +283,20 @@ def test_auto_takes_the_traversal_that_suits_the_rays(rng, session):
         assert sum(auto == other for other in others) == 1
 
 
+def test_auto_sorts_rays_whose_bundles_it_improves(rng, session):
+    """Runs of 32 neighbours in any order: asked for bundles, `dual` always sorts such rays."""
+    scene = triangle_soup(rng, 20_000, size=0.02)
+    side = (np.arange(256) + 0.5) / 128 - 1
+    directions = np.stack((*np.meshgrid(side, side), np.full((256, 256), 2.0)), axis=-1)
+    runs = rng.permutation(directions.reshape(-1, 32, 3))
+    rays = np.broadcast_to([0.5, 0.5, -1.5], (256 * 256, 3)), runs.reshape(-1, 3)
+    auto, bundle = (rs.Tracer(scene, "dual", traversal=t) for t in ("auto", "bundle"))
+    for tracer in (auto, bundle):
+        tracer.intersect(*rays)
+    assert "sorting" in auto.statistics.stages
+    assert auto.statistics.levels == bundle.statistics.levels
+
+
 def test_the_better_builder_is_taken_for_many_rays(rng):
     scene, rays = triangle_soup(rng, 1000), random_rays(rng, 1600)
     auto, fast, quality = (rs.Tracer(scene, "dual", builder=b) for b in ("auto", "fast", "quality"))
