@@ -27,9 +27,10 @@ _COUNTS = (
     "rays", "nodes", "box_tests", "boxes", "leaves", "leaf_tests", "leaf_boxes", "tests", "hits"
 )  # fmt: skip
 
-# The better builder takes 75 ns more for each triangle and saves 25 ns of a ray (medians of five
-# scenes and five kinds of rays, 34,000 to 331,000 triangles, two cores).
-_RAYS_OF_QUALITY = 3
+# Nanoseconds, medians of eight scenes of 24,000 to 331,000 triangles and 262,144 rays of five
+# kinds, two cores: what the better builder takes more for each triangle, and saves of a ray.
+_COST_OF_QUALITY = 58
+_SAVED_BY_QUALITY = {"single": 28, "bundle": 7, "stream": 28}
 # See `DualTracer._choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from
 # a light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a
 # bundle, streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of
@@ -63,6 +64,55 @@ class _Coherence:
         return saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
 
 
+class _Trees:
+    """The scene hierarchies of a geometry, by builder, and the choice between them."""
+
+    def __init__(self, session, geometry, memory_limit, builder):
+        self.geometry = geometry
+        self._session, self._memory_limit, self._builder = session, memory_limit, builder
+        self._trees, self._built, self._version = {}, None, None
+        self._saved, self._saved_before = 0, 0  # by quality: in this version, in the last
+        self._quality_fits = True
+
+    def current(self):
+        """The `SceneTree` of the geometry as it is now."""
+        self._notice_change()
+        builder = self._chosen() if self._builder == "auto" else self._builder
+        if builder not in self._trees:
+            self._add(builder)
+        if builder != self._built:
+            self._trees[builder].build()
+            self._built = builder
+        return self._trees[builder]
+
+    def expect(self, traversal, num_rays):
+        """Rays that are about to be traced: they may be worth another hierarchy."""
+        self._notice_change()
+        self._saved += _SAVED_BY_QUALITY[traversal] * num_rays
+
+    def _notice_change(self):
+        if self._version != self.geometry.version:
+            self._built, self._version = None, self.geometry.version
+            self._saved, self._saved_before = 0, self._saved
+
+    def _chosen(self):
+        cost = _COST_OF_QUALITY * self.geometry.num_triangles
+        if max(self._saved, self._saved_before) < cost or not self._quality_fits:
+            return "fast"
+        if "quality" not in self._trees:
+            try:
+                self._add("quality")
+            except MemoryLimitError:
+                self._quality_fits = False
+                return "fast"
+        return "quality"
+
+    def _add(self, builder):
+        taken = sum(tree.structure_bytes for tree in self._trees.values())
+        limit = self._memory_limit - taken
+        self._trees[builder] = SceneTree(self._session, self.geometry, builder, limit)
+
+
 class DualTracer:
     """Rays against a scene hierarchy, which is built anew when the geometry has changed.
 
@@ -73,9 +123,9 @@ class DualTracer:
     memory_limit : int
         Bytes that the scene hierarchy may take.
     builder : {"auto", "fast", "quality"}
-        See `raystream.tree.SceneTree`. "auto" takes "fast", and "quality" once the rays traced
-        since the geometry changed outnumber the triangles three times, where `memory_limit` allows
-        a second hierarchy.
+        See `raystream.tree.SceneTree`. "auto" takes "quality" where the rays traced since the
+        geometry changed, or those between the two changes before, gain what it costs, and
+        `memory_limit` allows a second hierarchy; else "fast".
     traversal : {"auto", "single", "bundle", "stream"}
         How rays walk the hierarchy. "auto" measures which is the fastest for the rays of each call.
 
@@ -97,40 +147,8 @@ class DualTracer:
     def __init__(self, session, geometry, memory_limit, builder="auto", traversal="auto"):
         check_choice("builder", builder, ("auto", *BUILDERS))
         check_choice("traversal", traversal, TRAVERSALS)
-        self.session, self.geometry, self._memory_limit = session, geometry, memory_limit
-        self._builder, self._traversal = builder, traversal
-        self._trees, self._built, self._version, self._num_traced = {}, None, None, 0
-        self._quality_fits = True
-
-    def tree(self, num_rays=0):
-        """The `SceneTree` of the geometry as it is now, for so many rays to come."""
-        if self._version != self.geometry.version:
-            self._built, self._version, self._num_traced = None, self.geometry.version, 0
-        self._num_traced += num_rays
-        builder = self._chosen_builder() if self._builder == "auto" else self._builder
-        if builder not in self._trees:
-            self._add_tree(builder)
-        if builder != self._built:
-            self._trees[builder].build()
-            self._built = builder
-        return self._trees[builder]
-
-    def _chosen_builder(self):
-        many = self._num_traced >= _RAYS_OF_QUALITY * self.geometry.num_triangles
-        if not (self._quality_fits and (many or self._built == "quality")):
-            return "fast"
-        if "quality" not in self._trees:
-            try:
-                self._add_tree("quality")
-            except MemoryLimitError:
-                self._quality_fits = False
-                return "fast"
-        return "quality"
-
-    def _add_tree(self, builder):
-        taken = sum(tree.structure_bytes for tree in self._trees.values())
-        limit = self._memory_limit - taken
-        self._trees[builder] = SceneTree(self.session, self.geometry, builder, limit)
+        self.session, self._traversal = session, traversal
+        self._trees = _Trees(session, geometry, memory_limit, builder)
 
     def intersect(self, rays):
         """Closest hits of `rays`; returns (HitStream, Statistics)."""
@@ -143,9 +161,13 @@ class DualTracer:
         blocked = self.session.empty(len(rays), np.uint8)
         return blocked, self._trace("occlude", rays, blocked)
 
+    def tree(self):
+        """The `SceneTree` of the geometry as it is now."""
+        return self._trees.current()
+
     def _trace(self, query, rays, result):
-        self.tree(len(rays))
         plan = self._plan(query, rays, result)
+        self._trees.expect(plan.traversal, len(rays))
         return self._statistics(self._run(query, plan, rays, result))
 
     def _plan(self, query, rays, result):
@@ -214,7 +236,7 @@ class DualTracer:
             final_tests=counts["tests"],
             final_hits=counts["hits"],
             rays=counts["rays"],
-            triangles=self.geometry.num_triangles,
+            triangles=self._trees.geometry.num_triangles,
             batches=1,
             structure_bytes=self.tree().structure_bytes,
         )
