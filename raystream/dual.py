@@ -53,7 +53,7 @@ class _Plan:
 
 @dataclasses.dataclass
 class _Coherence:
-    """Of bundles: nodes and leaves that they visit per ray, rays that enter one of them."""
+    """Of bundles: visits of nodes and leaves for each ray, inactive ones too; rays sharing one."""
 
     visits: float
     shared: float
@@ -198,7 +198,8 @@ class DualTracer:
     def _coherence(self, query, plan, rays, result):
         counts = self._run(query, plan, rays, result, most=_SAMPLES)
         visits = counts["nodes"] + counts["leaves"]
-        return _Coherence(visits / max(1, counts["rays"]), counts["boxes"] / max(1, visits))
+        places = min(plan.slots.shape[0], _SAMPLES * _RAYS[plan.traversal])
+        return _Coherence(visits / places, counts["boxes"] / max(1, visits))
 
     def _run(self, query, plan, rays, result, most=None):
         """Trace the rays, or up to `most` work-items' spread evenly; returns the counts."""
