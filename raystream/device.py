@@ -28,6 +28,7 @@ def devices():
     list of pyopencl.Device
         In the order of the platforms; empty where there is none.
     """
+    pocl.pin_threads()
     try:
         platforms = cl.get_platforms()
     except cl.Error:  # the loader raises where no platform is installed

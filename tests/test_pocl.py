@@ -1,6 +1,8 @@
 """The check of PoCL: its messages, its memory, the processor's name."""
 
+import os
 import subprocess
+import sys
 import types
 
 import pytest
@@ -35,6 +37,32 @@ def test_a_working_device_is_checked_once(cpu, fresh_cache, monkeypatch):
     assert len(list(fresh_cache.iterdir())) == 1
     monkeypatch.setattr(subprocess, "run", None)  # a second child would fail
     assert pocl.failure(cpu) is None
+
+
+_COUNT_PINNED = """
+import pathlib, raystream as rs
+rs.Tracer(rs.scenes.cornell()).occluded([[0, 0, 0]], [[0, 0, 1]])
+status = [path.read_text() for path in pathlib.Path("/proc/self/task").glob("*/status")]
+allowed = [line.split()[1] for text in status for line in text.splitlines()
+           if line.startswith("Cpus_allowed_list")]
+print(sum(cores.isdigit() for cores in allowed))
+"""
+
+
+@pytest.mark.parametrize("variables", [{}, {"POCL_AFFINITY": "0"}, {"POCL_MAX_PTHREAD_COUNT": "1"}])
+def test_threads_are_pinned_one_to_a_core(cpu, variables):
+    cores = os.cpu_count()
+    if cores == 1 or len(os.sched_getaffinity(0)) != cores:
+        pytest.skip("this process may not use all cores, or there is one")
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("POCL_")}
+    done = subprocess.run(
+        [sys.executable, "-c", _COUNT_PINNED],
+        env={**inherited, **variables},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(done.stdout) == (0 if variables else cores)
 
 
 def test_an_abort_for_want_of_a_linker_says_what_to_install(cpu, fresh_cache, monkeypatch):
