@@ -1,4 +1,4 @@
-"""Is PoCL usable here, and fast? Found out in a child process, once per machine, before work starts.
+"""Is PoCL usable here? Found out in a child process, once per machine, before work starts.
 
 Two faults of the PoCL 3.0 wheel end a process or stop every build; Python cannot catch the first:
 
