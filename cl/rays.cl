@@ -1,5 +1,5 @@
 // Packing a caller's ray arrays, already on the device, into the ray layout of all tracers:
-// org_tnear (origin, tnear) and dir_tfar (direction, tfar), a float4 each.
+// org_tnear (origin, tnear) and dir_tfar (direction, tfar), a float4 each; and telling rays of a screen.
 //
 // Refused is a ray that no tracer can take: a value that is NaN, an origin or direction that is
 // infinite, a zero direction, a negative tnear.
@@ -8,6 +8,8 @@
 
 #include "common.h"
 
+#define LEAST_SIDE 8  // of a screen
+#define FARTHEST 4.0f // neighbours may be so much farther apart than the first two
 #define TRIPLES 0x1111u // the first of every four bits
 
 // A caller's arrays. A stride is 1, or 0 where all rays share one value.
@@ -95,6 +97,35 @@ kernel void pack_rays(const uint num_rays, global const float *restrict origins,
             if (!pack_ray(&given, i, org_tnear, dir_tfar))
                 first = MIN(first, i);
     first_refused[get_global_id(0)] = first;
+}
+
+inline float square(float4 v) { return v.x * v.x + v.y * v.y + v.z * v.z; }
+
+// How far ray j is from ray i.
+inline float gap(global const float4 *org_tnear, global const float4 *dir_tfar, ulong i, ulong j)
+{
+    return square(org_tnear[j] - org_tnear[i]) + square(dir_tfar[j] - dir_tfar[i]);
+}
+
+// One work-item: the length of the rows where rays are those of a screen, pixel by pixel and row by row,
+// else 0. Along a row each is near the one before, like the second to the first; it ends where one is not;
+// and each row starts near the start of the row before.
+kernel void find_rows(const uint num_rays, global const float4 *restrict org_tnear,
+                      global const float4 *restrict dir_tfar, global uint *restrict row)
+{
+    *row = 0;
+    if (num_rays < LEAST_SIDE * LEAST_SIDE)
+        return;
+    const float near = FARTHEST * FARTHEST * gap(org_tnear, dir_tfar, 0, 1);
+    uint length = 1;
+    while (length < num_rays && gap(org_tnear, dir_tfar, length - 1, length) <= near)
+        length++;
+    if (length < LEAST_SIDE || num_rays % length != 0 || num_rays / length < LEAST_SIDE)
+        return;
+    for (ulong i = length; i < num_rays; i += length)
+        if (!(gap(org_tnear, dir_tfar, i - length, i) <= near))
+            return;
+    *row = length;
 }
 
 // Rays from the camera through every pixel, row by row from the top: direction = forward + sx right

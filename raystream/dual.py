@@ -41,6 +41,7 @@ _SAMPLES = 32
 _SHARED_BY_BUNDLE = 3.6
 _SHARED_WHEN_SORTED = 30
 _VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.45, 40_000
+_VISITS_OF_A_SORTED_STREAM = 20  # more miss the cache
 
 
 @dataclasses.dataclass
@@ -173,9 +174,10 @@ class DualTracer:
     def _plan(self, query, rays, result):
         """How to trace these rays, and in which order: only bundles gain by one."""
         given, traversal = leaf_slots(self.session, rays), self._traversal
-        sort = traversal == "bundle" and rays.size is None
+        sort = traversal == "bundle"
         if traversal == "auto":
             traversal, sort = self._choice(query, rays, given, result)
+        sort &= rays.size is None  # tiles of a screen are as good as any order
         return _Plan(
             traversal, sorted_slots(self.session, rays, given, DEFAULT_HASH) if sort else given
         )
@@ -184,7 +186,7 @@ class DualTracer:
         """The traversal that suits the rays, and whether they should be sorted for it.
 
         A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
-        stream costs what each ray's nodes and leaves cost, in whatever order its rays are. So it
+        stream costs what each ray's nodes and leaves cost, almost whatever their order. So it
         matters how many visits bundles make, and how many rays share one: a few bundles in the
         given order, spread over all, are traced to see.
         """
@@ -192,7 +194,7 @@ class DualTracer:
             return "single", False
         coherence = self._coherence(query, _Plan("bundle", given), rays, result)
         if coherence.shared < _SHARED_BY_BUNDLE:
-            return "stream", False
+            return "stream", coherence.visits > _VISITS_OF_A_SORTED_STREAM
         return "bundle", coherence.worth_a_sort(len(rays))
 
     def _coherence(self, query, plan, rays, result):

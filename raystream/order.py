@@ -63,17 +63,12 @@ def leaf_slots(session, rays):
     Array of shape (n,) uint32
         Kept by the session: uploaded once per size.
     """
-    key = rays.size if rays.size is not None else len(rays)
-    cache = session.cache.setdefault("leaf_slots", {})
-    if key not in cache:
-        host = (
-            np.arange(len(rays), dtype=np.uint32)
-            if rays.size is None
-            else _screen_slots(*rays.size)
-        )
-        cache.clear()  # one order at a time: sizes change rarely
-        cache[key] = session.upload(RAY_CREATION, host)
-    return cache[key]
+    kept = session.cache.setdefault("leaf_slots", {})
+    kind, size = ("rays", len(rays)) if rays.size is None else ("screen", rays.size)
+    if kind not in kept or kept[kind][0] != size:  # one of each kind: sizes change rarely
+        host = np.arange(size, dtype=np.uint32) if kind == "rays" else _screen_slots(*size)
+        kept[kind] = size, session.upload(RAY_CREATION, host)
+    return kept[kind][1]
 
 
 def hashed_slots(session, rays, slots, name):

@@ -21,7 +21,7 @@ class Rays:
     org_tnear, dir_tfar : pyopencl.array.Array of shape (n, 4) float32
         Origin and tnear, direction and tfar. A ray with tfar < tnear is inactive: it hits nothing.
     size : (int, int) or None
-        (width, height) where ray i belongs to pixel i of a screen, row by row from the top.
+        (width, height) where ray i belongs to pixel i of a screen, row by row.
     light : int or None
         Of shadow rays that all start at one light: its number.
     primary : bool
@@ -102,21 +102,18 @@ def _pack(session, count, origins, directions, tnear, tfar):
     if count == 0:
         return packed, 0
     chunks = _chunks(session)
-    first_refused = session.empty(chunks, np.uint32)
-    session.launch(
-        RAY_CREATION,
-        _kernels(session)["pack_rays"],
-        chunks,
-        np.uint32(count),
-        origins,
-        directions,
-        *tnear,
-        *tfar,
-        packed.org_tnear,
-        packed.dir_tfar,
-        first_refused,
-    )
-    return packed, int(first_refused.get().min())  # waits: shared arrays may change from here on
+    first_refused, row = session.empty(chunks, np.uint32), session.empty(1, np.uint32)
+    stream = packed.org_tnear, packed.dir_tfar
+
+    def launch(kernel, items, *args):
+        session.launch(RAY_CREATION, _kernels(session)[kernel], items, np.uint32(count), *args)
+
+    launch("pack_rays", chunks, origins, directions, *tnear, *tfar, *stream, first_refused)
+    launch("find_rows", 1, *stream, row)
+    first = int(first_refused.get().min())  # waits: shared arrays may change from here on
+    width = int(row.get()[0])
+    packed.size = (width, count // width) if width else None
+    return packed, first
 
 
 def _chunks(session):

@@ -108,3 +108,32 @@ def test_arrays_of_any_alignment_and_none_that_may_be_written(session, rng):
         org_tnear, dir_tfar = packed(session, origins, directions)
         np.testing.assert_array_equal(org_tnear[:, :3], origins)
         np.testing.assert_array_equal(dir_tfar[:, :3], directions)
+
+
+def pixels(width, height, unit, parallel=False):
+    """Rays through the pixels of a screen, row by row: from one point, or parallel."""
+    x, y = np.meshgrid(np.arange(width) - width / 2, height / 2 - np.arange(height))
+    grid = np.stack((x, y, np.full_like(x, -unit)), axis=-1).reshape(-1, 3).astype(np.float32)
+    same = np.tile(np.float32([0.5, 0, -3]), (len(grid), 1))
+    return (grid, same) if parallel else (same, grid)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (512, 512), (640, 480), (13, 101), (101, 13)])
+def test_rays_of_a_screen_are_recognised(size, session):
+    origins, directions = pixels(*size, unit=max(size))
+    normalised = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    for rays_of in ((origins, directions), (origins, normalised), pixels(*size, 1, parallel=True)):
+        assert rays.from_numpy(session, *rays_of, 0.0, np.inf).size == size
+
+
+def test_other_rays_are_no_screen(session, rng):
+    origins, directions = pixels(64, 64, unit=64)
+    order = np.arange(4096)
+    tiles = order.reshape(8, 8, 8, 8).transpose(0, 2, 1, 3).ravel()
+    gap = np.delete(order, slice(1000, 1010))
+    for chosen in (tiles, rng.permutation(order), gap, order[1:], order[: 7 * 64], order[:63]):
+        stream = rays.from_numpy(session, origins[chosen], directions[chosen], 0.0, np.inf)
+        assert stream.size is None
+    same = np.ones((4096, 3), np.float32)
+    assert rays.from_numpy(session, same, same, 0.0, np.inf).size is None
+    assert rays.from_numpy(session, *random_rays(rng, 4096), 0.0, np.inf).size is None
