@@ -12,8 +12,8 @@
 // The number of elements is in device memory: *length, of arrays that may be longer.
 //
 // Build-time constants: KEY (uint, ulong), VALUE (uint, ulong), CHUNKS, DIGITS (2^bits of a digit);
-// KEYS_ALONE where there are no values; FROM_PACKED, TO_PACKED where the pass reads or writes packed
-// words. Arrays that these rule out are not touched.
+// KEYS_ALONE where there are no values, VALUES_ALONE where the last pass keeps no keys; FROM_PACKED,
+// TO_PACKED where the pass reads or writes packed words. Arrays that these rule out are not touched.
 
 #include "common.h"
 
@@ -73,7 +73,9 @@ kernel void scatter_digits(global const uint *restrict length, const uint shift,
 #ifdef TO_PACKED
         packed_out[place] = (uint2)(key, LOAD_VALUE(i));
 #else
+#ifndef VALUES_ALONE
         keys_out[place] = key;
+#endif
 #ifndef KEYS_ALONE
         values_out[place] = LOAD_VALUE(i);
 #endif

@@ -112,7 +112,9 @@ def sort(session, chunks, bits):
     numbers = session.empty(chunks.keys.shape, np.uint32)
     _launch(session, SORTING, "number_chunks", chunks.length, numbers)
     with session.clock.under(SORTING):
-        return radix.sort_by_key(session, chunks.keys, numbers, bits, chunks.length)[1]
+        return radix.sort_by_key(
+            session, chunks.keys, numbers, bits, chunks.length, keep_keys=False
+        )[1]
 
 
 def decompress(session, chunks, order, rays, count):

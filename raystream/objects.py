@@ -157,7 +157,9 @@ class _Clusters(Objects):
         oversize = np.float32(_OVERSIZE * np.sqrt(self.size / triangles))
         self._launch("bound_centres", self._chunks, blocks, bounds, self._boxes)
         self._launch("make_keys", self._chunks, blocks, oversize, bounds, self._boxes, self._keys)
-        _, order = sort_by_key(self.session, self._keys, self._identity, _KEY_BITS)
+        _, order = sort_by_key(
+            self.session, self._keys, self._identity, _KEY_BITS, keep_keys=False
+        )
         arrays = order, self.geometry.bounds, self.order, self.bound_rows
         self._launch("arrange_bounds", self._chunks, blocks, triangles, *arrays)
 

@@ -103,4 +103,6 @@ def sorted_slots(session, rays, slots, name):
     """
     keys, _ = hash.hash_rays(session, rays, slots, name)
     with session.clock.under(SORTING):
-        return sort_by_key(session, keys, slots, hash.BITS[name], digit_bits=_DIGIT_BITS)[1]
+        return sort_by_key(
+            session, keys, slots, hash.BITS[name], digit_bits=_DIGIT_BITS, keep_keys=False
+        )[1]

@@ -16,7 +16,9 @@ _CHUNKS_PER_UNIT = 2
 _TYPES = {4: "uint", 8: "ulong"}
 
 
-def sort_by_key(session, keys, values, bits, length=None, digit_bits=_DIGIT_BITS):
+def sort_by_key(
+    session, keys, values, bits, length=None, digit_bits=_DIGIT_BITS, keep_keys=True
+):
     """Keys in ascending order by their lowest `bits` bits, and values in the order of their keys.
 
     Parameters
@@ -28,6 +30,8 @@ def sort_by_key(session, keys, values, bits, length=None, digit_bits=_DIGIT_BITS
     length : Array of shape (1,) uint32, optional
         How many elements there are, where only the device knows: the first `length` are sorted,
         the rest of the result means nothing. Default: all n.
+    keep_keys : bool
+        Whether the sorted keys are asked for; a store less for each pair where they are not.
     digit_bits : int
         Of a pass, where the keys fit the cache. 12 are faster than 8 where keys near each other
         in the stream are close, half as fast where they are not.
@@ -35,21 +39,23 @@ def sort_by_key(session, keys, values, bits, length=None, digit_bits=_DIGIT_BITS
     Returns
     -------
     keys, values : Array
-        New arrays, stable; values None where there were none.
+        New arrays, stable; values None where there were none, keys None where not asked for.
     """
     nbytes = keys.nbytes + (0 if values is None else values.nbytes)
     buffered = session.exceeds_cache(nbytes)
     passes = -(-bits // (_BUFFERED_DIGIT_BITS if buffered else digit_bits))
     if passes == 0 or keys.size == 0:
-        return [None if array is None else array.copy() for array in (keys, values)]
+        arrays = keys if keep_keys else None, values
+        return [None if array is None else array.copy() for array in arrays]
     if length is None:
         length = session.empty(1, np.uint32)
         session.fill(STREAM_REDUCTION, length, keys.size)
     source = _Elements(keys, values)
     run = _Passes(session, source, length, bits, -(-bits // passes), buffered)
     for step in range(passes):
-        source = run.scatter(source, step, last=step == passes - 1)
-    return source.keys, source.values
+        last = step == passes - 1
+        source = run.scatter(source, step, last, keep_keys or not last)
+    return source.keys if keep_keys else None, source.values
 
 
 @dataclasses.dataclass
@@ -80,13 +86,15 @@ class _Passes:
         arrays = (self.keys, self.values)
         return _Elements(*(a if a is None else self.session.empty(count, a.dtype) for a in arrays))
 
-    def scatter(self, source, step, last):
+    def scatter(self, source, step, last, keep_keys):
         """One pass: `source` in the order of digit `step`."""
         count, shift = self.keys.size, np.uint32(step * self.digit_bits)
         if self.packs and not last:
             target = _Elements(packed=self.session.empty((count, 2), np.uint32))
         else:
             target = self._apart(count)
+            if self.packs and not keep_keys:
+                target.keys = None
         kernels = self._kernels(source, target, step)
         length, counts = self.length, self.counts
 
@@ -120,4 +128,6 @@ class _Passes:
             defines["FROM_PACKED"] = 1
         if target.packed is not None:
             defines["TO_PACKED"] = 1
+        elif target.keys is None:
+            defines["VALUES_ALONE"] = 1
         return self.session.kernels("sort.cl", **defines)

