@@ -3,7 +3,7 @@
 The scene hierarchy is `raystream.tree`'s. Rays walk it alone (cl/single.cl), as bundles of 64
 (cl/bundle.cl) or as streams of thousands (cl/ray_stream.cl); all three find the hits of `brute`,
 bit for bit. Which of them is faster depends on how many rays of a bundle share a visit of a node:
-see `DualTracer._choice`.
+see `_Coherence.choice`.
 """
 
 import dataclasses
@@ -27,11 +27,13 @@ _COUNTS = (
     "rays", "nodes", "box_tests", "boxes", "leaves", "leaf_tests", "leaf_boxes", "tests", "hits"
 )  # fmt: skip
 
-# Nanoseconds, medians of eight scenes of 24,000 to 331,000 triangles and 262,144 rays of five
-# kinds, two cores: what the better builder takes more for each triangle, and saves of a ray.
-_COST_OF_QUALITY = 58
-_SAVED_BY_QUALITY = {"single": 28, "bundle": 7, "stream": 28}
-# See `DualTracer._choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from
+# Eight scenes of 24,000 to 331,000 triangles and 262,144 rays of five kinds, two cores: the better
+# builder takes some 58 ns more for each triangle, and saves some 4 ns for each visit that bundles
+# in the given order make in the fast one's tree, where they make 1.6 times as many.
+_VISITS_WORTH_QUALITY = 14.5  # of a triangle
+_MORE_VISITS_IN_FAST = 1.6
+_ASSUMED_VISITS = 7  # of a ray, where they are not measured
+# See `_Coherence.choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from
 # a light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a
 # bundle, streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of
 # sorting and the better of bundles and streams. Where more did, sorted bundles shared a visit among
@@ -46,10 +48,11 @@ _VISITS_OF_A_SORTED_STREAM = 20  # more miss the cache
 
 @dataclasses.dataclass
 class _Plan:
-    """A traversal, and the order of the rays for it."""
+    """A traversal, the order of the rays for it, and the visits of each as a bundle's."""
 
     traversal: str
     slots: cla.Array
+    visits: float = _ASSUMED_VISITS
 
 
 @dataclasses.dataclass
@@ -59,10 +62,17 @@ class _Coherence:
     visits: float
     shared: float
 
-    def worth_a_sort(self, num_rays):
-        """Whether so many rays are likely to save more visits by being sorted than it costs."""
+    def choice(self, num_rays):
+        """The traversal that suits so many rays, and whether they should be sorted for it.
+
+        A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
+        stream costs what each ray's nodes and leaves cost, almost whatever their order. So it
+        matters how many visits bundles make, and how many rays share one.
+        """
+        if self.shared < _SHARED_BY_BUNDLE:
+            return "stream", self.visits > _VISITS_OF_A_SORTED_STREAM
         saved = self.visits * (1 - self.shared / _SHARED_WHEN_SORTED)
-        return saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
+        return "bundle", saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
 
 
 class _Trees:
@@ -72,7 +82,7 @@ class _Trees:
         self.geometry = geometry
         self._session, self._memory_limit, self._builder = session, memory_limit, builder
         self._trees, self._built, self._version = {}, None, None
-        self._saved, self._saved_before = 0, 0  # by quality: in this version, in the last
+        self._visits, self._visits_before = 0, 0  # in this version, in the last
         self._quality_fits = True
 
     def current(self):
@@ -86,19 +96,19 @@ class _Trees:
             self._built = builder
         return self._trees[builder]
 
-    def expect(self, traversal, num_rays):
-        """Rays that are about to be traced: they may be worth another hierarchy."""
+    def expect(self, visits):
+        """Rays are about to be traced with so many visits: they may be worth another hierarchy."""
         self._notice_change()
-        self._saved += _SAVED_BY_QUALITY[traversal] * num_rays
+        self._visits += visits * (_MORE_VISITS_IN_FAST if self._built == "quality" else 1)
 
     def _notice_change(self):
         if self._version != self.geometry.version:
             self._built, self._version = None, self.geometry.version
-            self._saved, self._saved_before = 0, self._saved
+            self._visits, self._visits_before = 0, self._visits
 
     def _chosen(self):
-        cost = _COST_OF_QUALITY * self.geometry.num_triangles
-        if max(self._saved, self._saved_before) < cost or not self._quality_fits:
+        worth = _VISITS_WORTH_QUALITY * self.geometry.num_triangles
+        if max(self._visits, self._visits_before) < worth or not self._quality_fits:
             return "fast"
         if "quality" not in self._trees:
             try:
@@ -125,8 +135,8 @@ class DualTracer:
         Bytes that the scene hierarchy may take.
     builder : {"auto", "fast", "quality"}
         See `raystream.tree.SceneTree`. "auto" takes "quality" where the rays traced since the
-        geometry changed, or those between the two changes before, gain what it costs, and
-        `memory_limit` allows a second hierarchy; else "fast".
+        geometry changed, or those between the two changes before, save what it costs, as far as
+        their visits tell, and `memory_limit` allows a second hierarchy; else "fast".
     traversal : {"auto", "single", "bundle", "stream"}
         How rays walk the hierarchy. "auto" measures which is the fastest for the rays of each call.
 
@@ -168,34 +178,25 @@ class DualTracer:
 
     def _trace(self, query, rays, result):
         plan = self._plan(query, rays, result)
-        self._trees.expect(plan.traversal, len(rays))
+        self._trees.expect(plan.visits * len(rays))
         return self._statistics(self._run(query, plan, rays, result))
 
     def _plan(self, query, rays, result):
-        """How to trace these rays, and in which order: only bundles gain by one."""
-        given, traversal = leaf_slots(self.session, rays), self._traversal
-        sort = traversal == "bundle"
-        if traversal == "auto":
-            traversal, sort = self._choice(query, rays, given, result)
-        sort &= rays.size is None  # tiles of a screen are as good as any order
-        return _Plan(
-            traversal, sorted_slots(self.session, rays, given, DEFAULT_HASH) if sort else given
-        )
+        """How to trace these rays, and in which order.
 
-    def _choice(self, query, rays, given, result):
-        """The traversal that suits the rays, and whether they should be sorted for it.
-
-        A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
-        stream costs what each ray's nodes and leaves cost, almost whatever their order. So it
-        matters how many visits bundles make, and how many rays share one: a few bundles in the
-        given order, spread over all, are traced to see.
+        A few bundles in the given order, spread over all, are traced to see.
         """
-        if len(rays) < _FEW_RAYS:
-            return "single", False
-        coherence = self._coherence(query, _Plan("bundle", given), rays, result)
-        if coherence.shared < _SHARED_BY_BUNDLE:
-            return "stream", coherence.visits > _VISITS_OF_A_SORTED_STREAM
-        return "bundle", coherence.worth_a_sort(len(rays))
+        given, traversal = leaf_slots(self.session, rays), self._traversal
+        sort, visits = traversal == "bundle", _ASSUMED_VISITS
+        if traversal == "auto" and len(rays) < _FEW_RAYS:
+            traversal = "single"
+        elif traversal == "auto":
+            coherence = self._coherence(query, _Plan("bundle", given), rays, result)
+            traversal, sort = coherence.choice(len(rays))
+            visits = coherence.visits
+        if sort and rays.size is None:  # tiles of a screen are as good as any order
+            given = sorted_slots(self.session, rays, given, DEFAULT_HASH)
+        return _Plan(traversal, given, visits)
 
     def _coherence(self, query, plan, rays, result):
         counts = self._run(query, plan, rays, result, most=_SAMPLES)
