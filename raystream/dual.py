@@ -37,12 +37,12 @@ _ASSUMED_VISITS = 7  # of a ray, where they are not measured
 # a light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a
 # bundle, streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of
 # sorting and the better of bundles and streams. Where more did, sorted bundles shared a visit among
-# some 30 of their 64 rays; sorting took as long as bundles for 0.3 visits of each ray and 40,000.
+# some 30 of their 64 rays; sorting took as long as bundles for 0.4 visits of each ray and 40,000.
 _FEW_RAYS = 8192
 _SAMPLES = 32
 _SHARED_BY_BUNDLE = 3.6
 _SHARED_WHEN_SORTED = 30
-_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.3, 40_000
+_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.4, 40_000
 _VISITS_OF_A_SORTED_STREAM = 20  # more miss the cache
 
 
