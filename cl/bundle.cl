@@ -5,9 +5,9 @@
 // enclose all of them: one interval test tells which of a node's eight children any ray may enter,
 // and where the first one enters. Children wait on a stack, nearest on top, with the rays that
 // entered their parent. When a child is popped each of these rays is tested against its box alone, up
-// to the ray's hit so far, unless the intervals say that all enter. Where few rays of a group are left they finish that child as single rays.
-// In a leaf, triangles whose box the intervals miss are dropped, the others are tested with sixteen
-// rays at once.
+// to the ray's hit so far, unless the intervals say that all enter. Where few rays are left they finish
+// that child as single rays. In a leaf, triangles whose box the intervals miss are dropped, the others
+// are tested with sixteen rays at once, or the few rays of a group one by one.
 //
 // Work-item g takes bundle g * stride; with a stride some bundles are traced to know the others by.
 
@@ -57,7 +57,7 @@ inline void widen(float *low, float *high, float16 v, int16 active)
     *high = MAX(*high, h);
 }
 
-// cl/dual.h: box_ray, lane by lane.
+// cl/dual.h: set_box_ray, lane by lane.
 inline void set_group(Group *g, const Rays16 *r, const Box *scene, Bounds *bounds)
 {
     const int16 active = r->tfar >= r->tnear;
@@ -118,8 +118,9 @@ typedef struct {
     float8 low[3], high[3];
 } Boxes;
 
-// Bit k: some ray may enter box k; at (*enter)[k] at the earliest. In `all`, bit k: every ray whose segment is
-// that of the bundle enters.
+// Bit k: some ray may enter box k; at (*enter)[k] at the earliest. In `all`, bit k: every ray enters, as
+// far as its hits leave it whole. No bound hangs on that: a ray that is taken for one that enters costs
+// its tests.
 INLINE uint enter_boxes(const Interval *v, const Boxes *boxes, float8 *enter, uint *all)
 {
     float8 a = v->begin, b = v->end, last_in = v->begin, first_out = v->end;
@@ -141,8 +142,9 @@ INLINE uint enter_boxes(const Interval *v, const Boxes *boxes, float8 *enter, ui
     return MASK8(a <= b);
 }
 
-// Rays of a group that enter a box, where all of the bundle go the same way along every axis: the planes at
-// which they enter and leave.
+// Rays of a group that enter a box, where all of the bundle go the same way along every axis: the planes
+// at which they enter and leave. All axes and groups straight on: with choices in between bundles took
+// 1.07 times as long.
 INLINE uint rays_entering(const Group *g, const float *first, const float *last)
 {
     float16 a = g->begin, b = g->end;

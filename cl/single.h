@@ -56,8 +56,8 @@ inline uint ray_in_slot(global const uint *slots, uint num_slots, uint i,
     return slots[i];
 }
 
-// A query's result for one ray, where `hit` is its closest hit or a miss. Hits are records of t, u, v and the
-// triangle: sorted rays are scattered over memory, and each touches one cache line.
+// The result of either query for a ray; `triangle` is INVALID where it hits nothing. Hits are records of
+// t, u, v and the triangle: sorted rays lie all over memory, and each touches one cache line.
 #define HIT_RECORDS global float4 *restrict hits
 #define STORE_RECORD(ray, t, u, v, triangle)                                                       \
     hits[ray] = (triangle) == INVALID ? (float4)(INFINITY, 0.0f, 0.0f, as_float(INVALID))          \
@@ -131,7 +131,7 @@ INLINE bool finish_leaf(const RayFrame *frame, const LeafTest *test, Closest *hi
     return hit->key != before;
 }
 
-// Both.
+// Both; test_list in ray_stream.cl does them apart.
 INLINE bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *leaf, Counts *c)
 {
     LeafTest test;

@@ -13,12 +13,13 @@ from raystream import compare, tables
 def test_rays_and_picture_meet_the_rules(scene_folder, real, monkeypatch):
     monkeypatch.setattr(compare, "TIMED_FRAMES", 1)
     scene = real.load(scene_folder)
-    results, _ = compare.compare(scene, ["rsh", "crsh"], real.camera, size=(128, 128))
+    results, _ = compare.compare(scene, ["rsh", "crsh", "dual"], real.camera, size=(128, 128))
     for result in results:
         assert result.checks[compare.SECONDARY].rays > 0 and result.checks[compare.SHADOW].rays > 0
         assert result.ok, tables.table([result])
-    first, second = (result.frame for result in results)
+    first, second, dual = (result.frame for result in results)
     np.testing.assert_array_equal(first.image, second.image)
+    np.testing.assert_array_equal(first.image, dual.image)
     assert first.statistics.final_hits == second.statistics.final_hits
 
 
