@@ -283,6 +283,16 @@ def test_auto_takes_the_traversal_that_suits_the_rays(rng, session):
         assert sum(auto == other for other in others) == 1
 
 
+@pytest.mark.parametrize("more", [0, 1])
+def test_streams_are_long_where_there_are_enough(more, rng, session):
+    """Of 1024 rays up to so many, of 4096 from there on: the hits are the same."""
+    count = 4096 * 16 * session.device.max_compute_units - 1 + more
+    scene, rays = triangle_soup(rng, 60, size=0.3), random_rays(rng, count)
+    found = [rs.Tracer(scene, "dual", traversal=t).intersect(*rays) for t in ("single", "stream")]
+    for field in ("t", "prim_id", "u", "v"):
+        np.testing.assert_array_equal(*(getattr(hits, field) for hits in found))
+
+
 def test_auto_sorts_rays_whose_bundles_it_improves(rng, session):
     """Runs of 32 neighbours in any order: asked for bundles, `dual` always sorts such rays."""
     scene = triangle_soup(rng, 20_000, size=0.02)
