@@ -66,7 +66,7 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
     int8 count = 0;
     for (uint i = 0; i < list.count; i++) {
         const SingleRay *r = s->rays + s->ids[list.begin + i];
-        PREFETCH(s->rays + s->ids[list.begin + MIN(i + SOON, list.count - 1)]);
+        PREFETCH_PRIVATE(s->rays + s->ids[list.begin + MIN(i + SOON, list.count - 1)]);
         float8 enter;
         int8 enters = enter_children(&r->box, rows, &enter);
         if (s->any && r->hit.key != MISS)
@@ -114,7 +114,7 @@ inline void test_list(Stream *s, List list, global const float8 *leaf, Counts *c
         const uint count = MIN(list.count - i, 16u);
         uint inside = 0;
         for (uint k = 0; k < count; k++)
-            PREFETCH(&s->rays[ids[i + k]].frame);
+            PREFETCH_PRIVATE(&s->rays[ids[i + k]].frame);
         for (uint k = 0; k < count; k++)
             inside |= (uint)test_edges(&s->rays[ids[i + k]].frame, leaf, tests + k) << k;
         for (; inside != 0; inside &= inside - 1) {

@@ -25,7 +25,7 @@
 //   LOAD_UNALIGNED(T, p), STORE_UNALIGNED(T, p, v)   T a vector of sixteen
 //   STORE_UNALIGNED_QUAD(p, v)     v an uint4
 //   LOAD_PRIVATE(T, p), STORE_PRIVATE(T, p, v)         the same in private memory
-//   PREFETCH(p)                    the line at p will be read
+//   PREFETCH(p), PREFETCH_PRIVATE(p)  the line at p will be read, in global or private memory
 //   STORE_STREAMING(T, p, v)       to global memory aligned to T, past the caches
 //
 // Build-time constant: PORTABLE, where defined, keeps the x86 built-ins out.
@@ -155,6 +155,7 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define CONVERT(T, v) __builtin_convertvector(v, T)
 #define STORE_STREAMING(T, p, v) __builtin_nontemporal_store(v, (global T *)(p))
 #define PREFETCH(p) __builtin_prefetch((const void *)(ulong)(p))
+#define PREFETCH_PRIVATE(p) PREFETCH(p)
 #define LOW_PAIRS(a, b)                                                                            \
     __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23)
 #define HIGH_PAIRS(a, b)                                                                           \
@@ -198,6 +199,7 @@ inline ulong TEST64(global const uchar *p, uint bit)
 #define CONVERT(T, v) CONVERT_(T, v)
 #define STORE_STREAMING(T, p, v) (*(global T *)(p) = (v))
 #define PREFETCH(p) prefetch(p, 1)
+#define PREFETCH_PRIVATE(p) // OpenCL C has none
 #define CONVERT_(T, v) convert_##T(v)
 #define LOAD_UNALIGNED(T, p) vload16(0, p)
 #define LOAD_PRIVATE(T, p) vload16(0, p)
