@@ -35,17 +35,16 @@ _COUNTS = (
 _VISITS_WORTH_QUALITY = 14.5  # of a triangle
 _MORE_VISITS_IN_FAST = 1.6
 _ASSUMED_VISITS = 7  # of a ray, where they are not measured
-# See `_Coherence.choice`. Measured with eight scenes, 8,281 to 1,048,576 rays from a camera, from
-# a light, off mirrors and at random, two cores. Where fewer than 3.6 rays shared a visit of a
-# bundle, streams in the given order took 0.7 to 1.04 (in one case of ten 1.16) of the time of
-# sorting and the better of bundles and streams. Where more did, sorted bundles shared a visit among
-# some 30 of their 64 rays; sorting took as long as bundles for 0.4 visits of each ray and 40,000.
+# See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
+# from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
+# 1.026 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
+# 1.43). Sorted bundles share a visit among up to some 30 of their 64 rays; sorting takes as long
+# as bundles for 0.4 visits of each ray and 40,000.
 _FEW_RAYS = 8192
 _SAMPLES = 32
 _SHARED_BY_BUNDLE = 3.6
 _SHARED_WHEN_SORTED = 30
 _VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.4, 40_000
-_VISITS_OF_A_SORTED_STREAM = 20  # more miss the cache
 
 
 @dataclasses.dataclass
@@ -72,7 +71,7 @@ class _Coherence:
         matters how many visits bundles make, and how many rays share one.
         """
         if self.shared < _SHARED_BY_BUNDLE:
-            return "stream", self.visits > _VISITS_OF_A_SORTED_STREAM
+            return "stream", False
         saved = self.visits * (1 - self.shared / _SHARED_WHEN_SORTED)
         return "bundle", saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
 
