@@ -326,6 +326,17 @@ def test_the_better_builder_is_taken_for_many_rays(rng):
         trace(expected)
 
 
+def test_incoherent_rays_are_worth_the_better_builder_sooner(rng, session):
+    """As many rays of a camera and at random: the first visit little, the second much."""
+    scene = triangle_soup(rng, 1000, size=0.08)
+    scattered = from_numpy(session, *random_rays(rng, 128 * 128), 0.0, np.inf)
+    for rays, builder in ((grid_of_rays(128, 128), "fast"), (scattered, "quality")):
+        auto, expected = (rs.Tracer(scene, "dual", builder=b) for b in ("auto", builder))
+        for tracer in (auto, expected):
+            tracer.intersect_stream(session, rays)
+        assert auto.statistics.levels == expected.statistics.levels
+
+
 def test_single_rays_count_what_they_visit():
     """A ray that misses the scene meets the root; one triangle is one node and one leaf."""
     scene = rs.Scene([mesh_of("one", np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]]], np.float32))])
