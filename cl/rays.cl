@@ -78,12 +78,12 @@ inline bool pack_rays16(const Given *g, ulong i, global float4 *org_tnear, globa
     return MASK16(good) == 0xffff && directions == TRIPLES;
 }
 
-// first_refused[chunk]: the smallest index of a ray that is refused, INVALID where there is none.
+// facts[chunk]: the smallest index of a ray that is refused, INVALID where there is none.
 kernel void pack_rays(const uint num_rays, global const float *restrict origins,
                       global const float *restrict directions, global const float *restrict tnear,
                       const uint tnear_stride, global const float *restrict tfar,
                       const uint tfar_stride, global float4 *restrict org_tnear,
-                      global float4 *restrict dir_tfar, global uint *restrict first_refused)
+                      global float4 *restrict dir_tfar, global uint *restrict facts)
 {
     const Given given = {origins, directions, tnear, tfar, tnear_stride, tfar_stride};
     const ulong runs = num_rays / 16, stop = 16 * chunk_end(runs);
@@ -96,7 +96,7 @@ kernel void pack_rays(const uint num_rays, global const float *restrict origins,
         for (ulong i = 16 * runs; i < num_rays; i++)
             if (!pack_ray(&given, i, org_tnear, dir_tfar))
                 first = MIN(first, i);
-    first_refused[get_global_id(0)] = first;
+    facts[get_global_id(0)] = first;
 }
 
 inline float square(float4 v) { return v.x * v.x + v.y * v.y + v.z * v.z; }
@@ -107,12 +107,13 @@ inline float gap(global const float4 *org_tnear, global const float4 *dir_tfar, 
     return square(org_tnear[j] - org_tnear[i]) + square(dir_tfar[j] - dir_tfar[i]);
 }
 
-// One work-item: the length of the rows where rays are those of a screen, pixel by pixel and row by row,
-// else 0. Along a row each is near the one before, like the second to the first; it ends where one is not;
-// and each row starts near the start of the row before.
+// One work-item. facts[CHUNKS]: the length of the rows where rays are those of a screen, pixel by pixel
+// and row by row, else 0. Along a row each is near the one before, like the second to the first; it ends
+// where one is not; and each row starts near the start of the row before.
 kernel void find_rows(const uint num_rays, global const float4 *restrict org_tnear,
-                      global const float4 *restrict dir_tfar, global uint *restrict row)
+                      global const float4 *restrict dir_tfar, global uint *restrict facts)
 {
+    global uint *row = facts + CHUNKS;
     *row = 0;
     if (num_rays < LEAST_SIDE * LEAST_SIDE)
         return;

@@ -56,9 +56,10 @@ def pin_threads():
     with pauses. Nothing is done where ``$POCL_AFFINITY`` says what is wanted, or where PoCL's
     threads are not as many as the cores that this process may use: it takes the first ones.
     """
-    cores = os.cpu_count()
-    threads = int(os.environ.get("POCL_MAX_PTHREAD_COUNT") or cores)
-    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == cores == threads:
+    cores = str(os.cpu_count())
+    threads = os.environ.get("POCL_MAX_PTHREAD_COUNT") or cores
+    allowed = str(len(os.sched_getaffinity(0))) if hasattr(os, "sched_getaffinity") else None
+    if allowed == cores == threads:
         os.environ.setdefault("POCL_AFFINITY", "1")
 
 

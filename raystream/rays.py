@@ -102,18 +102,17 @@ def _pack(session, count, origins, directions, tnear, tfar):
     if count == 0:
         return packed, 0
     chunks = _chunks(session)
-    first_refused, row = session.empty(chunks, np.uint32), session.empty(1, np.uint32)
+    facts = session.empty(chunks + 1, np.uint32)
     stream = packed.org_tnear, packed.dir_tfar
 
     def launch(kernel, items, *args):
         session.launch(RAY_CREATION, _kernels(session)[kernel], items, np.uint32(count), *args)
 
-    launch("pack_rays", chunks, origins, directions, *tnear, *tfar, *stream, first_refused)
-    launch("find_rows", 1, *stream, row)
-    first = int(first_refused.get().min())  # waits: shared arrays may change from here on
-    width = int(row.get()[0])
+    launch("pack_rays", chunks, origins, directions, *tnear, *tfar, *stream, facts)
+    launch("find_rows", 1, *stream, facts)
+    *refused, width = facts.get().tolist()  # waits: shared arrays may change from here on
     packed.size = (width, count // width) if width else None
-    return packed, first
+    return packed, min(refused)
 
 
 def _chunks(session):
