@@ -11,7 +11,7 @@ those of the fewest tests over the scenes of tests/bench/bench_counts.py.
 """
 
 from raystream.checks import check_choice, check_count
-from raystream.hash import DEFAULT_HASH, HASHES
+from raystream.hash import DEFAULT_HASH
 from raystream.objects import Objects
 from raystream.order import hashed_slots
 from raystream.pairs import FUSED
@@ -63,7 +63,7 @@ class CoherentTracer(RayspaceTracer):
     ):
         check_count("levels", levels)
         super().__init__(session, geometry, memory_limit, arity, levels, reduction, bound)
-        check_choice("hash", hash, (*HASHES, None))
+        check_choice("hash", hash, ("paper", DEFAULT_HASH, None))
         check_choice("cull_meshes", cull_meshes, (True, False))
         if clusters == "auto":
             clusters = None if bound == "paper" else _CLUSTER_SIZE

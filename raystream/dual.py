@@ -13,7 +13,6 @@ import pyopencl.array as cla
 
 from raystream.checks import check_choice
 from raystream.errors import MemoryLimitError
-from raystream.hash import DEFAULT_HASH
 from raystream.intersect import HitStream, sum_counts
 from raystream.order import leaf_slots, sorted_slots
 from raystream.statistics import TRAVERSAL, Statistics
@@ -196,7 +195,7 @@ class DualTracer:
             traversal, sort = coherence.choice(len(rays))
             visits = coherence.visits
         if sort and rays.size is None:  # tiles of a screen are as good as any order
-            given = sorted_slots(self.session, rays, given, DEFAULT_HASH)
+            given = sorted_slots(self.session, rays, given, "coarse")
         return _Plan(traversal, given, visits)
 
     def _coherence(self, query, plan, rays, result):

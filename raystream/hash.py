@@ -15,9 +15,12 @@ HASHES = {
         "WIDE_BITS": 12,
         "END_BITS": 8,
     },
+    # For `dual`: bundles of 64 gain less by the last bits than sorting by them takes.
+    "coarse": {"COARSE_BITS": 2, "CELL_BITS": 4, "FINE_BITS": 2, "WIDE_BITS": 10, "END_BITS": 6},
 }
 DEFAULT_HASH = "octahedral"
-BITS = {"paper": 32, "octahedral": 24}  # of a key; the paper's has the light's number on top
+# Of a key; the paper's has the light's number on top.
+BITS = {"paper": 32, "octahedral": 24, "coarse": 20}
 _CHUNKS_PER_UNIT = 32
 
 

@@ -10,7 +10,7 @@ from raystream.statistics import RAY_CREATION, SORTING
 
 _INVALID = np.uint32(0xFFFFFFFF)
 _TILE = 8
-_DIGIT_BITS = 12  # neighbours in the stream have close hashes but for rays of random starts
+_DIGIT_BITS = 10  # two passes over coarse hashes
 
 
 def screen_slots(width, height):

@@ -13,7 +13,7 @@ from soup import (
 )
 
 import raystream as rs
-from raystream import hash, scenes
+from raystream import scenes
 from raystream.statistics import COMPRESSION, DECOMPRESSION, RAY_CREATION, SORTING
 
 PAPER = {"hash": "paper", "bound": "paper", "arity": 8, "levels": 2}
@@ -116,7 +116,7 @@ def test_sorting_saves_tests_of_incoherent_rays(rng):
     origins = np.tile([0.5, 0.5, -2.0], (4096, 1))
     directions = np.concatenate([rng.random((4096, 2)) - 0.5, np.full((4096, 1), 2.0)], axis=1)
     totals = {}
-    for name in (None, *hash.HASHES):
+    for name in (None, "paper", "octahedral"):
         tracer = rs.Tracer(scene, "crsh", **{**PAPER, "hash": name})
         tracer.intersect(origins, directions)
         totals[name] = tracer.statistics.total_tests

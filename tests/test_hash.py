@@ -139,3 +139,4 @@ def test_any_number_of_rays_and_any_values(name, count, session, rng):
     directions[~directions.any(axis=1)] = 1
     keys, active = keys_of(session, origins, directions, name)
     assert len(keys) == count and active.all()
+    assert (keys.astype(np.uint64) < 1 << hash.BITS[name]).all()
