@@ -181,7 +181,7 @@ INLINE RayFrame frame_of_lane(const Group *g, uint lane)
     const RayFrame f = {LANE(float, frame.ox),      LANE(float, frame.oy),      LANE(float, frame.oz),
                         LANE(float, frame.shear_x), LANE(float, frame.shear_y), LANE(float, frame.scale),
                         LANE(float, frame.tnear),   LANE(float, frame.tfar),
-                        z == 2 ? 0 : z + 1,         z == 0 ? 2 : z - 1,         z};
+                        TURNED_X(z),                TURNED_Y(z),                z};
     return f;
 }
 
@@ -440,16 +440,13 @@ inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, b
 #define DEFINE_BUNDLE(NAME, ANY, RESULT, STORE)                                                    \
     kernel void NAME(TRAVERSAL_ARGUMENTS, RESULT)                                                  \
     {                                                                                              \
-        const uint first = get_global_id(0) * stride * RAYS;                                       \
-        const Tree tree = {nodes, leaves};                                                         \
-        const Box scene = scene_box(nodes);                                                        \
-        Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
+        BEGIN_TRAVERSAL                                                                            \
         Bundle b;                                                                                  \
         start_bundle(&b, first, num_slots, &scene, ANY, slots, org_tnear, dir_tfar);               \
         c.rays = COUNT64(b.open);                                                                  \
         if (b.open != 0)                                                                           \
             walk_bundle(&b, &tree, &c);                                                            \
-        for (uint i = 0; i < RAYS && first + i < num_slots; i++) {                                 \
+        for (uint i = 0; first + i < stop; i++) {                                                  \
             const Group *g = b.groups + i / 16;                                                    \
             const uint lane = i % 16, ray = slots[first + i];                                      \
             if (ray != INVALID)                                                                    \

@@ -40,6 +40,8 @@ inline float size_of(float v) { return v < 0.0f ? -v : v; }
 
 inline float4 size_of4(float4 v) { return v < 0.0f ? -v : v; }
 
+inline float largest3(float4 v) { return MAX(v.x, MAX(v.y, v.z)); }
+
 inline float lowest8(float8 v)
 {
     const float4 a = v.lo < v.hi ? v.lo : v.hi;

@@ -42,7 +42,7 @@ kernel void make_grid(const uint resolution, global const float4 *restrict boxes
     float4 low, high;
     enclose_chunks(boxes, &low, &high);
     const float4 extent = high - low;
-    float edge = MAX(extent.x, MAX(extent.y, extent.z));
+    float edge = largest3(extent);
     edge = edge > SMALLEST_BOX ? edge : SMALLEST_BOX;
     const float4 part = extent / edge;
     const float per_unit = (float)resolution / edge * (1.0f - MARGIN);

@@ -38,8 +38,6 @@ inline Box scene_box(global const float8 *root)
     return b;
 }
 
-inline float largest3(float4 v) { return MAX(v.x, MAX(v.y, v.z)); }
-
 inline void set_box_ray(BoxRay *r, const Box *scene, float4 org_tnear, float4 dir_tfar)
 {
     const float4 o = org_tnear, d = dir_tfar;

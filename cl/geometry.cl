@@ -19,8 +19,7 @@
 
 inline float largest(float4 v)
 {
-    const float4 m = fabs(v);
-    return MAX(m.x, MAX(m.y, m.z));
+    return largest3(fabs(v));
 }
 
 // Centre from the first vertex, for edges ab and ac of a size near one.

@@ -74,8 +74,6 @@ kernel void make_grid(global const float4 *restrict corners, global Box *restric
     }
 }
 
-inline float largest(float4 v) { return MAX(v.x, MAX(v.y, v.z)); }
-
 // `x` >= 0 rounded down, at most `last`; NaN, of infinite extents, is `last`.
 inline uint16 whole(float16 x, uint last)
 {
@@ -144,12 +142,12 @@ inline uint16 place(float16 x, float16 y, float16 z, Box box, uint bits)
 
 INLINE uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
 {
-    if (largest(origins.extent) <= 0.0f && largest(ends.extent) < INFINITY)
+    if (largest3(origins.extent) <= 0.0f && largest3(ends.extent) < INFINITY)
         return place(FMA16(r.dx, r.tfar, r.ox), FMA16(r.dy, r.tfar, r.oy),
                      FMA16(r.dz, r.tfar, r.oz), ends, END_BITS);
     uint16 x, y;
     octahedral(&r, &x, &y);
-    if (largest(origins.extent) <= 0.0f)
+    if (largest3(origins.extent) <= 0.0f)
         return interleave(x, y);
     const uint left = WIDE_BITS - COARSE_BITS - FINE_BITS;
     const uint16 direction = interleave(x >> left, y >> left);

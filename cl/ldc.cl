@@ -146,7 +146,7 @@ inline float4 normal_of(global const float4 *v)
 {
     const float4 ab = v[1] - v[0], ac = v[2] - v[0];
     const float4 m = MAX(size_of4(ab), size_of4(ac));
-    const float scale = MAX(m.x, MAX(m.y, m.z));
+    const float scale = largest3(m);
     return cross3(ab / scale, ac / scale);
 }
 
@@ -514,7 +514,7 @@ inline void aim(Trace *t, const Grid *grid, float4 org_tnear, float4 dir_tfar)
     for (uint k = 0; k < 3; k++)
         t->inverse[k] = t->d[k] == 0.0f ? 0.0f : 1.0f / t->d[k];
     sort_axes(t->d, t->order);
-    t->slack = SLACK * MAX(far.x, MAX(far.y, far.z));
+    t->slack = SLACK * largest3(far);
     t->tolerance += t->slack;
     t->per_t = length * grid->per_unit;
     Span s = {org_tnear.w * t->per_t, t->frame.tfar * t->per_t};

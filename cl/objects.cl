@@ -388,7 +388,7 @@ kernel void make_keys(const uint num_blocks, const float oversize,
     float4 low, high;
     enclose_chunks(boxes, &low, &high);
     const float4 size = high - low;
-    const float largest = MAX(size.x, MAX(size.y, size.z));
+    const float largest = largest3(size);
     const float cells = (1 << CELL_BITS) / largest, limit = oversize * largest;
     for (uint block = chunk_begin(num_blocks), end = chunk_end(num_blocks); block < end; block++) {
         global const float16 *rows = bound_rows + BOUND_ROWS * (ulong)block;

@@ -152,11 +152,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
 #define DEFINE_STREAM(NAME, ANY, RESULT, STORE)                                                    \
     kernel void NAME(TRAVERSAL_ARGUMENTS, RESULT)                                                  \
     {                                                                                              \
-        const uint first = get_global_id(0) * stride * RAYS;                                       \
-        const uint stop = MIN(first + RAYS, num_slots);                                            \
-        const Tree tree = {nodes, leaves};                                                         \
-        const Box scene = scene_box(nodes);                                                        \
-        Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
+        BEGIN_TRAVERSAL                                                                            \
         Stream s;                                                                                  \
         uint number[RAYS];                                                                         \
         s.any = ANY;                                                                               \

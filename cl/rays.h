@@ -30,6 +30,13 @@ INLINE Rays16 load_rays(ulong first, ulong stop, global const float4 *org_tnear,
     return transpose_rays(origins, directions);
 }
 
+// A ray that will be read, unless it is INVALID.
+inline void prefetch_ray(uint ray, global const float4 *org_tnear, global const float4 *dir_tfar)
+{
+    PREFETCH(org_tnear + (ray == INVALID ? 0 : ray));
+    PREFETCH(dir_tfar + (ray == INVALID ? 0 : ray));
+}
+
 // The rays in slots first, first + step, ...; inactive (tfar = -inf) from slot `stop` on and where a slot
 // holds no ray.
 INLINE Rays16 gather_rays(ulong first, uint step, ulong stop, global const uint *slots,
@@ -39,9 +46,7 @@ INLINE Rays16 gather_rays(ulong first, uint step, ulong stop, global const uint 
     for (uint lane = 0; lane < 16; lane++) {
         const ulong slot = first + lane * step;
         const uint ray = slot < stop ? slots[slot] : INVALID;
-        const uint soon = slots[MIN(slot + AHEAD * step, stop - 1)];
-        PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));
-        PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));
+        prefetch_ray(slots[MIN(slot + AHEAD * step, stop - 1)], org_tnear, dir_tfar);
         origins[lane] = org_tnear[ray == INVALID ? 0 : ray];
         directions[lane] = dir_tfar[ray == INVALID ? 0 : ray];
         directions[lane].w = ray == INVALID ? -INFINITY : directions[lane].w;

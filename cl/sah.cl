@@ -31,7 +31,7 @@
 #define TOP_LEVELS (TREE_DEPTH - TASK_LEVELS)
 #define KEY_DIGITS 10 // of three bits: an octree level each
 
-// A thing: -low x, y, z, its number; high x, y, z. Boxes are joined by the larger of each.
+// A thing: -low x, y, z, its number; high x, y, z. Boxes are joined by `larger8`.
 #define NUMBER s3
 
 // What is between the first two, of things or of doubled middles of their boxes.
@@ -39,8 +39,6 @@ typedef struct {
     float8 box, middles;
     uint begin, end;
 } Range;
-
-inline float8 join(float8 a, float8 b) { return a > b ? a : b; }
 
 inline float8 middle(float8 thing)
 {
@@ -53,8 +51,8 @@ inline Range measure(global const float8 *things, uint begin, uint end)
     Range r = {-INFINITY, -INFINITY, begin, end};
     for (uint i = begin; i < end; i++) {
         const float8 thing = things[i];
-        r.box = join(r.box, thing);
-        r.middles = join(r.middles, middle(thing));
+        r.box = larger8(r.box, thing);
+        r.middles = larger8(r.middles, middle(thing));
     }
     return r;
 }
@@ -101,14 +99,14 @@ inline uint best_plane(const Binning *b, global const float8 *things, const Rang
     }
     for (uint i = r->begin; i < r->end; i++) {
         const uint bin = bin_of(b, things, i);
-        boxes[i & 1][bin] = join(boxes[i & 1][bin], things[i]);
+        boxes[i & 1][bin] = larger8(boxes[i & 1][bin], things[i]);
         counts[i & 1][bin]++;
     }
     float behind[BINS];
     float8 box = -INFINITY;
     uint count = 0;
     for (uint k = BINS - 1; k > 0; k--) {
-        box = join(box, join(boxes[0][k], boxes[1][k]));
+        box = larger8(box, larger8(boxes[0][k], boxes[1][k]));
         count += counts[0][k] + counts[1][k];
         behind[k] = count == 0 ? INFINITY : half_area(box) * ((count + grain - 1) / grain);
     }
@@ -117,7 +115,7 @@ inline uint best_plane(const Binning *b, global const float8 *things, const Rang
     uint plane = 0;
     box = -INFINITY, count = 0;
     for (uint k = 1; k < BINS; k++) {
-        box = join(box, join(boxes[0][k - 1], boxes[1][k - 1]));
+        box = larger8(box, larger8(boxes[0][k - 1], boxes[1][k - 1]));
         count += counts[0][k - 1] + counts[1][k - 1];
         const float cost = half_area(box) * ((count + grain - 1) / grain) + behind[k];
         if (count > 0 && count < all && cost < best)
@@ -242,11 +240,11 @@ inline uint split_few(global float8 *things, const Range *r, float8 *front, floa
             boxes[k] = -INFINITY;
         for (uint i = 0; i < count; i++) {
             const uint k = ranks[axis][i] / TREE_WIDTH;
-            boxes[k] = join(boxes[k], few[i]);
+            boxes[k] = larger8(boxes[k], few[i]);
         }
         behind[leaves - 1] = boxes[leaves - 1];
         for (uint k = leaves - 1; k > 0; k--)
-            behind[k - 1] = join(behind[k], boxes[k - 1]);
+            behind[k - 1] = larger8(behind[k], boxes[k - 1]);
         float8 before = boxes[0];
         for (uint k = 1; k < leaves; k++) {
             const float cost = half_area(before) * k + half_area(behind[k]) * (leaves - k);
@@ -254,7 +252,7 @@ inline uint split_few(global float8 *things, const Range *r, float8 *front, floa
                 best = cost, best_axis = axis, best_leaves = k;
                 *front = before, *back = behind[k];
             }
-            before = join(before, boxes[k]);
+            before = larger8(before, boxes[k]);
         }
     }
     for (uint i = 0; i < count; i++)

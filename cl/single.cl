@@ -12,11 +12,7 @@
 #define DEFINE_SINGLE(NAME, ANY, RESULT, STORE)                                                    \
     kernel void NAME(TRAVERSAL_ARGUMENTS, RESULT)                                                  \
     {                                                                                              \
-        const uint first = get_global_id(0) * stride * RAYS;                                       \
-        const uint stop = MIN(first + RAYS, num_slots);                                            \
-        const Tree tree = {nodes, leaves};                                                         \
-        const Box scene = scene_box(nodes);                                                        \
-        Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};                                                    \
+        BEGIN_TRAVERSAL                                                                            \
         for (uint i = first; i < stop; i++) {                                                      \
             const uint ray = ray_in_slot(slots, num_slots, i, org_tnear, dir_tfar);                \
             if (ray == INVALID)                                                                    \

@@ -46,13 +46,19 @@ inline void store_counts(const Counts *c, global ulong *counts)
         global const float8 *restrict nodes, global const float8 *restrict leaves,                 \
         global ulong *restrict counts
 
+// How every traversal begins: with its slots from `first` to `stop`.
+#define BEGIN_TRAVERSAL                                                                            \
+    const uint first = get_global_id(0) * stride * RAYS;                                           \
+    const uint stop = MIN(first + RAYS, num_slots);                                                \
+    const Tree tree = {nodes, leaves};                                                             \
+    const Box scene = scene_box(nodes);                                                            \
+    Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};
+
 // The ray in a slot, INVALID where there is none.
 inline uint ray_in_slot(global const uint *slots, uint num_slots, uint i,
                         global const float4 *org_tnear, global const float4 *dir_tfar)
 {
-    const uint soon = slots[MIN(i + AHEAD, num_slots - 1)];
-    PREFETCH(org_tnear + (soon == INVALID ? 0 : soon));
-    PREFETCH(dir_tfar + (soon == INVALID ? 0 : soon));
+    prefetch_ray(slots[MIN(i + AHEAD, num_slots - 1)], org_tnear, dir_tfar);
     return slots[i];
 }
 

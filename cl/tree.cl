@@ -68,7 +68,7 @@ kernel void place_triangles(const uint num_triangles, global const float4 *restr
     float4 low, high;
     enclose_chunks(boxes, &low, &high);
     const float4 size = high - low;
-    const float largest = MAX(size.x, MAX(size.y, size.z));
+    const float largest = largest3(size);
     const float cells = (1 << CELL_BITS) / largest;
     for (uint block = chunk_begin(num_blocks), end = chunk_end(num_blocks); block < end; block++) {
         float16 m[3];

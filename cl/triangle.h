@@ -28,6 +28,10 @@ DEFINE_CORNER(Corner, float)
 DEFINE_CORNER(Corner8, float8)
 DEFINE_CORNER(Corner16, float16)
 
+// The components that are turned to x and y, where z is.
+#define TURNED_X(z) ((z) == 2 ? 0 : (z) + 1)
+#define TURNED_Y(z) ((z) == 0 ? 2 : (z) - 1)
+
 // The origin is turned, too.
 typedef struct {
     float ox, oy, oz;
@@ -36,7 +40,7 @@ typedef struct {
     uint x, y, z; // the components of a vertex that are turned to x, y, z
 } RayFrame;
 
-// Rays in lanes: `z` is the major axis of each; as in RayFrame where it is that of all.
+// Rays in lanes, each with its major axis; x, y, z as in RayFrame where one is that of all, not `mixed`.
 #define DEFINE_RAY_FRAME(NAME, F, I)                                                               \
     typedef struct {                                                                               \
         F ox, oy, oz;                                                                              \
@@ -135,8 +139,8 @@ DEFINE_FINISH_HIT(finish_hit_run, float16, int16, RayFrame, TriangleHit16)
         const I along_x = (x >= y) & (x >= z), along_y = ~along_x & (y >= z);                      \
         r->major = along_x ? (I)0 : along_y ? (I)1 : (I)2;                                         \
         r->z = MASK(live & along_x) ? 0 : MASK(live & along_y) ? 1 : 2;                            \
-        r->x = (r->z + 1) % 3;                                                                     \
-        r->y = (r->z + 2) % 3;                                                                     \
+        r->x = TURNED_X(r->z);                                                                     \
+        r->y = TURNED_Y(r->z);                                                                     \
         r->mixed = MASK(live & (r->major != (int)r->z)) != 0;                                      \
         const Corner##W org = turn##W(o[0], o[1], o[2], r->major);                                 \
         const Corner##W dir = turn##W(d[0], d[1], d[2], r->major);                                 \
@@ -176,7 +180,7 @@ inline RayFrame ray_frame(float4 org_tnear, float4 dir_tfar)
     const float ax = size_of(d[0]), ay = size_of(d[1]), az = size_of(d[2]);
     // The major axis is the largest component, so the shears are at most one in size.
     const uint z = ax >= ay && ax >= az ? 0 : ay >= az ? 1 : 2;
-    const uint x = z == 2 ? 0 : z + 1, y = z == 0 ? 2 : z - 1;
+    const uint x = TURNED_X(z), y = TURNED_Y(z);
     // A distance that leaves the range of float is no hit: infinity stays above tfar.
     const RayFrame r = {o[x],  o[y],  o[z],  -(d[x] / d[z]), -(d[y] / d[z]), 1.0f / d[z],
                         o[3], MIN(d[3], MAXFLOAT), x, y, z};

@@ -139,13 +139,20 @@ def sum_counts(session, counts):
     Waits for the device, which has them ready by then: on the host it would take 0.2 ms.
     """
     sums = session.empty(counts.shape[1], np.uint64)
-    kernel = session.kernels("intersect.cl", CHUNKS=CHUNKS)["sum_counts"]
-    session.launch(FINAL_INTERSECTION, kernel, 1, *map(np.uint32, counts.shape), counts, sums)
+    sizes = map(np.uint32, counts.shape)
+    kernel = _kernels(session)["sum_counts"]
+    session.launch(FINAL_INTERSECTION, kernel, 1, *sizes, counts, sums)
     return sums.get().tolist()
 
 
 def _launch(session, kernel, *args):
     """Run a kernel of this file, a work-item for each chunk."""
-    chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
-    kernels = session.kernels("intersect.cl", CHUNKS=chunks)
-    session.launch(FINAL_INTERSECTION, kernels[kernel], chunks, *args)
+    session.launch(FINAL_INTERSECTION, _kernels(session)[kernel], _chunks(session), *args)
+
+
+def _chunks(session):
+    return _CHUNKS_PER_UNIT * session.device.max_compute_units
+
+
+def _kernels(session):
+    return session.kernels("intersect.cl", CHUNKS=_chunks(session))

@@ -67,24 +67,12 @@ def load(name, folder):
     return real.load(folder), real.camera, real.light
 
 
-def camera_rays(camera, side):
-    """Through the pixels of a square image, row by row."""
-    right, up, forward = camera.basis
-    steps = 2 * (np.arange(side) + 0.5) / side - 1
-    extent = np.tan(np.radians(camera.fov_y) / 2)
-    directions = forward + extent * (
-        steps[None, :, None] * np.asarray(right) - steps[:, None, None] * np.asarray(up)
-    )
-    directions = directions.reshape(-1, 3).astype(np.float32)
-    return np.tile(np.float32(camera.eye), (side * side, 1)), directions
-
-
 def visible_points(scene, camera, count):
     """`count` points that the camera sees, row by row: points, unit normals, unit directions."""
     embree, side = EmbreeTracer(scene.vertices, scene.faces), int(count**0.5)
-    origins, directions = camera_rays(camera, side)
+    origins, directions = camera.rays((side, side))
     seen = (embree.intersect(origins[::7], directions[::7]).prim_id >= 0).mean()
-    origins, directions = camera_rays(camera, int(np.ceil(1.02 * side / seen**0.5)))
+    origins, directions = camera.rays((int(np.ceil(1.02 * side / seen**0.5)),) * 2)
     hits = embree.intersect(origins, directions)
     hit = np.flatnonzero(hits.prim_id >= 0)
     hit = hit[np.arange(count) * len(hit) // count]
@@ -110,7 +98,7 @@ def rays_of(kind, scene, camera, light, count):
     """(origins, directions, tfar) of one of KINDS, `count` a square number."""
     rng = np.random.default_rng(7)
     if kind == "primary":
-        return *camera_rays(camera, int(count**0.5)), np.inf
+        return *camera.rays((int(count**0.5),) * 2), np.inf
     low, high = scene.vertices.min(axis=0), scene.vertices.max(axis=0)
     if kind == "random":
         return _float32(low + (high - low) * rng.random((count, 3)), rng.normal(size=(count, 3)))
