@@ -139,8 +139,8 @@ class Camera:
         sy = (1 - 2 * (np.arange(height) + offset[1]) / height) * tangent
         rows = forward + sy[:, None] * up
         directions = (rows[:, None] + sx[None, :, None] * right).reshape(-1, 3)
-        origins = np.broadcast_to(self.eye, directions.shape)
-        return origins.astype(np.float32), directions.astype(np.float32)
+        origins = np.tile(self.eye.astype(np.float32), (len(directions), 1))
+        return origins, directions.astype(np.float32)
 
 
 def _check_angle(fov_y):

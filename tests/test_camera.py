@@ -38,6 +38,11 @@ def test_rays_of_the_four_pixels_of_a_2_by_2_picture():
     )
 
 
+def test_rays_lie_in_memory_as_tracers_take_them():
+    for array in Camera.look_at((1, 2, 3), (0, 0, 0)).rays((3, 2)):
+        assert array.shape == (6, 3) and array.flags.c_contiguous
+
+
 def test_offset_moves_within_the_pixel_from_its_upper_left_corner():
     camera = Camera.look_at((0, 0, 1), (0, 0, 0), fov_y=90)
     np.testing.assert_allclose(camera.rays((1, 1), (0, 0))[1], [[-1, 1, -1]], atol=1e-7)
