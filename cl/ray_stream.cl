@@ -5,7 +5,7 @@
 // A stack entry is a child with the list of the rays that entered it. At a node every ray of its list is
 // tested against the eight boxes; the ids of those that enter a child are compressed into that child's
 // list. Children are pushed by the mean distance at which their rays enter, nearest on top. Where few
-// rays are left, or no room for lists, they finish the child as single rays.
+// rays are left, or no room for the lists of all children, they finish the node as single rays.
 //
 // Build-time constant: RAYS, to a work-item.
 
@@ -13,7 +13,7 @@
 
 #define SOON 8 // rays ahead in a list: all rays of a stream are more than the first cache holds
 #define FEW 4 // rays that are better off alone
-#define ROOM (12 * RAYS) // for the ids of all lists on the stack
+#define ROOM (16 * RAYS) // for the ids of all lists on the stack; of 40 cases two asked for more
 
 typedef struct {
     uint node, begin, count;
@@ -48,12 +48,24 @@ inline uint compress_list(const Stream *s, List list, uint k, uint *out)
     return count;
 }
 
+// Where one hit is enough, a ray that has one enters no box from here on.
+inline void close(const Stream *s, SingleRay *r)
+{
+    if (s->any)
+        r->box.end = -INFINITY;
+}
+
+inline bool is_closed(const Stream *s, const SingleRay *r) { return s->any && r->hit.key != MISS; }
+
 inline void finish_list(Stream *s, const Tree *tree, List list, Counts *c)
 {
     for (uint i = 0; i < list.count; i++) {
         SingleRay *r = s->rays + s->ids[list.begin + i];
-        if (!(s->any && r->hit.key != MISS))
-            walk(r, tree, list.node, s->any, c);
+        if (is_closed(s, r))
+            continue;
+        walk(r, tree, list.node, s->any, c);
+        if (r->hit.key != MISS)
+            close(s, r);
     }
 }
 
@@ -68,9 +80,7 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
         const SingleRay *r = s->rays + s->ids[list.begin + i];
         PREFETCH_PRIVATE(s->rays + s->ids[list.begin + MIN(i + SOON, list.count - 1)]);
         float8 enter;
-        int8 enters = enter_children(&r->box, rows, &enter);
-        if (s->any && r->hit.key != MISS)
-            enters = 0;
+        const int8 enters = enter_children(&r->box, rows, &enter);
         s->entered[i] = (uchar)MASK8(enters);
         sum += enters ? enter : 0.0f;
         count -= enters;
@@ -80,11 +90,11 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
     *(float8 *)distance = sum / CONVERT(float8, count);
     *(uint8 *)counts = as_uint8(count);
     ulong order[8];
-    uint num = 0;
+    uint num = 0, total = 0;
     for (uint k = 0; k < 8; k++) {
         if (counts[k] == 0)
             continue;
-        c->boxes += counts[k];
+        total += counts[k];
         const ulong child = entry(distance[k], k);
         uint place = num++;
         for (; place > 0 && order[place - 1] < child; place--)
@@ -92,6 +102,10 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
         order[place] = child;
     }
     uint begin = list.begin + list.count;
+    if (begin + total > ROOM) {
+        finish_list(s, tree, list, c);
+        return top;
+    }
     for (uint i = 0; i < num; i++) {
         const uint k = (uint)order[i];
         const List child = {children[k], begin, counts[k]};
@@ -102,6 +116,7 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
     }
     c->nodes++;
     c->box_tests += TREE_WIDTH * list.count;
+    c->boxes += total;
     return top;
 }
 
@@ -120,9 +135,10 @@ inline void test_list(Stream *s, List list, global const float8 *leaf, Counts *c
         for (; inside != 0; inside &= inside - 1) {
             const uint k = LOWEST(inside);
             SingleRay *r = s->rays + ids[i + k];
-            if (!(s->any && r->hit.key != MISS)
-                && finish_leaf(&r->frame, tests + k, &r->hit, leaf, c))
+            if (!is_closed(s, r) && finish_leaf(&r->frame, tests + k, &r->hit, leaf, c)) {
                 shorten_ray(r);
+                close(s, r);
+            }
         }
     }
     c->leaves += list.count;
@@ -141,7 +157,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
         if (list.node & LEAF) {
             global const float8 *leaf = tree->leaves + (ulong)(list.node & ~LEAF) * LEAF_ROWS;
             test_list(s, list, leaf, c);
-        } else if (list.count <= FEW || list.begin + 9 * list.count > ROOM) {
+        } else if (list.count <= FEW) {
             finish_list(s, tree, list, c);
         } else {
             top = push_children(s, tree, list, stack, top, c);

@@ -284,13 +284,30 @@ def test_auto_takes_the_traversal_that_suits_the_rays(rng, session):
 
 
 @pytest.mark.parametrize("more", [0, 1])
-def test_streams_are_long_where_there_are_enough(more, rng, session):
-    """Of 1024 rays up to so many, of 4096 from there on: the hits are the same."""
-    count = 4096 * 16 * session.device.max_compute_units - 1 + more
+@pytest.mark.parametrize("length", [2048, 8192])
+def test_streams_are_long_where_there_are_enough(length, more, rng, session):
+    """From so many rays on streams are twice as long: the hits are the same."""
+    count = length * 16 * session.device.max_compute_units - 1 + more
     scene, rays = triangle_soup(rng, 60, size=0.3), random_rays(rng, count)
-    found = [rs.Tracer(scene, "dual", traversal=t).intersect(*rays) for t in ("single", "stream")]
+    tracers = [rs.Tracer(scene, "dual", traversal=t) for t in ("single", "stream")]
+    found = [tracer.intersect(*rays) for tracer in tracers]
     for field in ("t", "prim_id", "u", "v"):
         np.testing.assert_array_equal(*(getattr(hits, field) for hits in found))
+    # Every stream visits the root.
+    assert tracers[1].statistics.levels[0]["nodes"] >= -(-count // (length if more else length // 2))
+
+
+def test_a_stream_without_room_for_its_lists_finishes_as_single_rays(rng, session):
+    """All rays enter all boxes, deeper than there is room for: hits are the same."""
+    triangle = np.float32([[-9, -9, 0], [9, -9, 0], [0, 9, 0]])
+    heights = rng.random(20_000, np.float32)[:, None, None] * np.float32([0, 0, 1])
+    scene = rs.Scene([mesh_of("layers", triangle + heights)])
+    origins = rng.random((3000, 3), np.float32) * np.float32([0.1, 0.1, 0]) + [0, 0, 5]
+    rays = origins, np.tile([0, 0, -1], (3000, 1))
+    assert_exact(scene, *rays, traversals=("stream",), builder="fast")
+    dual = rs.Tracer(scene, "dual", traversal="stream", builder="fast")
+    dual.intersect(*rays)
+    assert dual.statistics.levels[0]["nodes"] > 3000  # as lists they would be some hundreds
 
 
 def test_auto_sorts_rays_whose_bundles_it_improves(rng, session):
