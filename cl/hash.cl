@@ -27,14 +27,15 @@ typedef struct {
     float4 extent; // infinite or NaN where a ray has no end
 } Box;
 
-// Boxes per chunk of all rays: low and high corner of the origins, of the ends; inf, -inf where empty.
-kernel void measure_rays(const ulong n, global const float4 *restrict org_tnear,
+// Boxes per chunk of rays, of every `step`-th run of sixteen: low and high corner of the origins, of the
+// ends; inf, -inf where empty.
+kernel void measure_rays(const ulong n, const uint step, global const float4 *restrict org_tnear,
                          global const float4 *restrict dir_tfar, global float4 *restrict corners)
 {
     float16 low[6], high[6];
     for (uint k = 0; k < 6; k++)
         low[k] = INFINITY, high[k] = -INFINITY;
-    for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
+    for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16 * step) {
         const Rays16 r = load_rays(i, end, org_tnear, dir_tfar);
         const int16 active = r.tfar >= r.tnear;
         if (MASK16(active) == 0)
@@ -74,10 +75,11 @@ kernel void make_grid(global const float4 *restrict corners, global Box *restric
     }
 }
 
-// `x` >= 0 rounded down, at most `last`; NaN, of infinite extents, is `last`.
+// `x` rounded down, at least 0 and at most `last`; NaN, of infinite extents, is `last`.
 inline uint16 whole(float16 x, uint last)
 {
-    return CONVERT(uint16, x < (float)last ? x : (float16)last);
+    const float16 most = x < (float)last ? x : (float16)last;
+    return CONVERT(uint16, most > 0.0f ? most : 0.0f);
 }
 
 inline uint16 cell(float16 x, float low, float extent, uint bits)
@@ -158,6 +160,34 @@ INLINE uint16 hash_rays16(Rays16 r, Box origins, Box ends, uint light)
 
 #endif
 
+// The keys of sixteen rays, 0 for those that are not `traced`: many a stream has few that are.
+INLINE uint16 keys_of(Rays16 r, int16 traced, Box origins, Box ends, uint light)
+{
+    if (MASK16(traced) == 0)
+        return 0;
+    return hash_rays16(r, origins, ends, light) & as_uint16(traced);
+}
+
+// keys[i] of ray i.
+kernel void hash_all(const ulong n, global const float4 *restrict org_tnear,
+                     global const float4 *restrict dir_tfar, global const Box *restrict grid,
+                     const uint light, global uint *restrict keys)
+{
+    const Box origins = grid[0], ends = grid[1];
+    for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
+        const Rays16 r = load_rays(i, end, org_tnear, dir_tfar);
+        const uint16 hashes = keys_of(r, r.tfar >= r.tnear, origins, ends, light);
+        if (i + 16 <= end) {
+            STORE_UNALIGNED(uint16, keys + i, hashes);
+            continue;
+        }
+        uint lanes[16] __attribute__((aligned(64)));
+        *(uint16 *)lanes = hashes;
+        for (uint k = 0; i + k < end; k++)
+            keys[i + k] = lanes[k];
+    }
+}
+
 // keys[i], and active[i]: whether slot i holds a ray that is traced.
 kernel void hash_rays(const ulong n, global const uint *restrict slots,
                       global const float4 *restrict org_tnear,
@@ -168,9 +198,7 @@ kernel void hash_rays(const ulong n, global const uint *restrict slots,
     for (ulong i = chunk_begin(n), end = chunk_end(n); i < end; i += 16) {
         const Rays16 r = gather_rays(i, 1, end, slots, org_tnear, dir_tfar);
         const int16 traced = r.tfar >= r.tnear;
-        uint16 hashes = 0;
-        if (MASK16(traced)) // many a stream has few rays
-            hashes = hash_rays16(r, origins, ends, light) & as_uint16(traced);
+        const uint16 hashes = keys_of(r, traced, origins, ends, light);
         const uchar16 flags = CONVERT(uchar16, -traced);
         if (i + 16 <= end) {
             STORE_UNALIGNED(uint16, keys + i, hashes);

@@ -20,6 +20,13 @@ INLINE Rays16 transpose_rays(const float4 *origins, const float4 *directions)
 INLINE Rays16 load_rays(ulong first, ulong stop, global const float4 *org_tnear,
                         global const float4 *dir_tfar)
 {
+    if (first + 16 <= stop) {
+        global const float4 *o = org_tnear + first, *d = dir_tfar + first;
+        Rays16 r;
+        TRANSPOSE16(o, r.ox, r.oy, r.oz, r.tnear);
+        TRANSPOSE16(d, r.dx, r.dy, r.dz, r.tfar);
+        return r;
+    }
     float4 origins[16] __attribute__((aligned(64))), directions[16] __attribute__((aligned(64)));
     for (uint lane = 0; lane < 16; lane++) {
         const ulong ray = MIN(first + lane, stop - 1);

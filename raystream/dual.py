@@ -14,7 +14,7 @@ import pyopencl.array as cla
 from raystream.checks import check_choice
 from raystream.errors import MemoryLimitError
 from raystream.intersect import HitStream, sum_counts
-from raystream.order import leaf_slots, sorted_slots
+from raystream.order import leaf_slots, sorted_rays
 from raystream.statistics import TRAVERSAL, Statistics
 from raystream.tree import BUILDERS, SceneTree
 
@@ -196,7 +196,7 @@ class DualTracer:
             traversal, sort = coherence.choice(len(rays))
             visits = coherence.visits
         if sort and rays.size is None:  # tiles of a screen are as good as any order
-            given = sorted_slots(self.session, rays, given, "coarse")
+            given = sorted_rays(self.session, rays, "coarse")
         return _Plan(traversal, given, visits)
 
     def _coherence(self, query, plan, rays, result):

@@ -22,6 +22,7 @@ DEFAULT_HASH = "octahedral"
 # Of a key; the paper's has the light's number on top.
 BITS = {"paper": 32, "octahedral": 24, "coarse": 20}
 _CHUNKS_PER_UNIT = 32
+_MEASURED_RUNS = 16  # of every so many runs of rays one is measured where a key need not be exact
 
 
 def hash_rays(session, rays, slots, name):
@@ -44,17 +45,54 @@ def hash_rays(session, rays, slots, name):
         Head flags: 1 where the slot holds a ray that is not inactive.
     """
     count = slots.shape[0]
-    chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
-    kernels = session.kernels("hash.cl", CHUNKS=chunks, **HASHES[name])
     keys, active = session.empty(count, np.uint32), session.empty(count, np.uint8)
-    corners, grid = (session.empty((n, 2, 4), np.float32) for n in (2 * chunks, 2))
-    light = np.uint32(0xFFFFFFFF if rays.light is None else rays.light)
-    stream = rays.org_tnear, rays.dir_tfar
-
-    def launch(kernel, size, *args):
-        session.launch(RAY_CREATION, kernels[kernel], size, *args)
-
-    launch("measure_rays", chunks, np.uint64(len(rays)), *stream, corners)
-    launch("make_grid", 1, corners, grid)
-    launch("hash_rays", chunks, np.uint64(count), slots, *stream, grid, light, keys, active)
+    grid = _grid(session, rays, name, step=1)
+    _launch(session, name, "hash_rays", count, slots, *_arguments(rays, grid), keys, active)
     return keys, active
+
+
+def hash_all(session, rays, name):
+    """Keys of all rays in the order in which they come, quickly.
+
+    The cells divide the box of a sixteenth of the rays: others may lie outside, in the cells at its
+    sides.
+
+    Returns
+    -------
+    Array of shape (n,) uint32
+        0 for inactive rays.
+    """
+    keys = session.empty(len(rays), np.uint32)
+    grid = _grid(session, rays, name, _MEASURED_RUNS)
+    _launch(session, name, "hash_all", len(rays), *_arguments(rays, grid), keys)
+    return keys
+
+
+def _grid(session, rays, name, step):
+    """What a key divides: the boxes of origins and ends of every `step`-th run of sixteen rays."""
+    chunks = _chunks(session)
+    corners, grid = (session.empty((n, 2, 4), np.float32) for n in (2 * chunks, 2))
+    stream = rays.org_tnear, rays.dir_tfar
+    _launch(session, name, "measure_rays", len(rays), np.uint32(step), *stream, corners)
+    kernel = _kernels(session, name)["make_grid"]
+    session.launch(RAY_CREATION, kernel, 1, corners, grid)
+    return grid
+
+
+def _arguments(rays, grid):
+    light = np.uint32(0xFFFFFFFF if rays.light is None else rays.light)
+    return rays.org_tnear, rays.dir_tfar, grid, light
+
+
+def _launch(session, name, kernel, count, *args):
+    """Run a kernel over the chunks of `count` elements."""
+    kernel = _kernels(session, name)[kernel]
+    session.launch(RAY_CREATION, kernel, _chunks(session), np.uint64(count), *args)
+
+
+def _kernels(session, name):
+    return session.kernels("hash.cl", CHUNKS=_chunks(session), **HASHES[name])
+
+
+def _chunks(session):
+    return _CHUNKS_PER_UNIT * session.device.max_compute_units

@@ -92,17 +92,26 @@ def hashed_slots(session, rays, slots, name):
     return compress.coherent_slots(session, keys, slots, active, hash.BITS[name])[0]
 
 
-def sorted_slots(session, rays, slots, name):
-    """All rays of `slots` sorted by their hashes; as `hashed_slots`, but inactive ones stay.
+def sorted_rays(session, rays, name):
+    """All rays, in the order of their hashes; inactive ones, too.
 
-    Where neighbours seldom have equal hashes, compressing runs of them costs more than it saves.
+    Where neighbours seldom have equal hashes, compressing runs of them, as `hashed_slots` does, costs
+    more than it saves.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    rays : raystream.rays.Rays
+        Not those of a screen: tiles of it are as good as any order.
+    name : str
+        One of `hash.HASHES`.
 
     Returns
     -------
     Array of shape (n,) uint32
     """
-    keys, _ = hash.hash_rays(session, rays, slots, name)
+    keys, given = hash.hash_all(session, rays, name), leaf_slots(session, rays)
     with session.clock.under(SORTING):
         return sort_by_key(
-            session, keys, slots, hash.BITS[name], digit_bits=_DIGIT_BITS, keep_keys=False
+            session, keys, given, hash.BITS[name], digit_bits=_DIGIT_BITS, keep_keys=False
         )[1]

@@ -140,3 +140,30 @@ def test_any_number_of_rays_and_any_values(name, count, session, rng):
     keys, active = keys_of(session, origins, directions, name)
     assert len(keys) == count and active.all()
     assert (keys.astype(np.uint64) < 1 << hash.BITS[name]).all()
+    assert (hash_all_of(session, origins, directions, name) < 1 << hash.BITS[name]).all()
+
+
+def hash_all_of(session, origins, directions, name):
+    stream = rays.from_numpy(session, origins, directions, 0.0, np.inf)
+    return hash.hash_all(session, stream, name).get()
+
+
+@pytest.mark.parametrize("name", hash.HASHES)
+@pytest.mark.parametrize("count", [2, 17, 1009, 100_003])
+def test_all_rays_get_the_same_keys_where_those_measured_say_how_far_they_reach(
+    name, count, session, rng
+):
+    """The first two are measured, whatever the number of chunks: they span the box."""
+    origins, directions = random_rays(rng, count)
+    origins[:2] = origins.min(axis=0), origins.max(axis=0)
+    keys, _ = keys_of(session, origins, directions, name)
+    np.testing.assert_array_equal(hash_all_of(session, origins, directions, name), keys)
+
+
+def test_rays_outside_the_measured_box_are_in_the_cells_at_its_sides(session, rng):
+    chunk = 1000
+    origins, directions = random_rays(rng, chunk * hash._chunks(session))
+    origins[100::chunk] *= F(-1e30)  # of runs 0, 16, 32, ... of each chunk no ray
+    keys = hash_all_of(session, origins, directions, "coarse")
+    assert keys.max() < 1 << hash.BITS["coarse"]
+    assert len(np.unique(keys)) > 10_000  # in a box of them all the others would be in one cell
