@@ -118,10 +118,11 @@ kernel void find_rows(const uint num_rays, global const float4 *restrict org_tne
     if (num_rays < LEAST_SIDE * LEAST_SIDE)
         return;
     const float near = FARTHEST * FARTHEST * gap(org_tnear, dir_tfar, 0, 1);
+    const uint longest = num_rays / LEAST_SIDE;
     uint length = 1;
-    while (length < num_rays && gap(org_tnear, dir_tfar, length - 1, length) <= near)
+    while (length <= longest && gap(org_tnear, dir_tfar, length - 1, length) <= near)
         length++;
-    if (length < LEAST_SIDE || num_rays % length != 0 || num_rays / length < LEAST_SIDE)
+    if (length < LEAST_SIDE || length > longest || num_rays % length != 0)
         return;
     for (ulong i = length; i < num_rays; i += length)
         if (!(gap(org_tnear, dir_tfar, i - length, i) <= near))

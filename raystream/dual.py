@@ -21,8 +21,9 @@ from raystream.tree import BUILDERS, SceneTree
 TRAVERSALS = ("auto", "single", "bundle", "stream")
 _FILES = {"single": "single.cl", "bundle": "bundle.cl", "stream": "ray_stream.cl"}
 _RAYS = 64  # to a work-item
-# The longer a stream, the more rays of it share a visit: 8192 take 0.94 of the time of 4096, of 16384
-# scattered rays gain more, others lose, in caches of 2 MB. Powers of two, as many as can be shared out.
+# The longer a stream, the more rays of it share a visit: with 8192 it takes 0.94 of the time of 4096;
+# with 16384 scattered rays gain more, others lose, in caches of 2 MB. Powers of two, as many as can
+# be shared out.
 _LEAST_STREAM, _LONGEST_STREAM, _STREAMS_PER_UNIT = 1024, 8192, 16
 # In the order of `Counts` (cl/single.h).
 _COUNTS = (

@@ -95,8 +95,8 @@ def hashed_slots(session, rays, slots, name):
 def sorted_rays(session, rays, name):
     """All rays, in the order of their hashes; inactive ones, too.
 
-    Where neighbours seldom have equal hashes, compressing runs of them, as `hashed_slots` does, costs
-    more than it saves.
+    Where neighbours seldom have equal hashes, compressing runs of them, as `hashed_slots` does,
+    costs more than it saves.
 
     Parameters
     ----------
