@@ -21,9 +21,9 @@ from raystream.tree import BUILDERS, SceneTree
 TRAVERSALS = ("auto", "single", "bundle", "stream")
 _FILES = {"single": "single.cl", "bundle": "bundle.cl", "stream": "ray_stream.cl"}
 _RAYS = 64  # to a work-item
-# The longer a stream, the more rays of it share a visit: with 8192 it takes 0.94 of the time of 4096;
-# with 16384 scattered rays gain more, others lose, in caches of 2 MB. Powers of two, as many as can
-# be shared out.
+# The longer a stream, the more rays of it share a visit: 8192 take 0.94 of the time of 4096; of
+# 16384 scattered rays gain more, others lose, in caches of 2 MB. Powers of two, as many as can be
+# shared out.
 _LEAST_STREAM, _LONGEST_STREAM, _STREAMS_PER_UNIT = 1024, 8192, 16
 # In the order of `Counts` (cl/single.h).
 _COUNTS = (
@@ -38,14 +38,15 @@ _MORE_VISITS_IN_FAST = 1.6
 _ASSUMED_VISITS = 7  # of a ray, where they are not measured
 # See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
-# 1.026 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
-# 1.43). Sorted bundles share a visit among up to some 30 of their 64 rays; sorting takes as long
-# as bundles for 0.4 visits of each ray and 40,000.
+# 1.008 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
+# 1.45). The more visits rays make, the fewer of them need to share one for sorted bundles to pay.
+# Sorted bundles share a visit among up to some 40 of their 64 rays; sorting takes as long as
+# bundles for 0.2 visits of each ray and 30,000.
 _FEW_RAYS = 8192
 _SAMPLES = 32
-_SHARED_BY_BUNDLE = 3.6
-_SHARED_WHEN_SORTED = 30
-_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.4, 40_000
+_SHARED_BY_BUNDLE, _LESS_FOR_A_VISIT = 5.2, 0.1
+_SHARED_WHEN_SORTED = 40
+_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.2, 30_000
 
 
 @dataclasses.dataclass
@@ -71,7 +72,7 @@ class _Coherence:
         stream costs what each ray's nodes and leaves cost, almost whatever their order. So it
         matters how many visits bundles make, and how many rays share one.
         """
-        if self.shared < _SHARED_BY_BUNDLE:
+        if self.shared < _SHARED_BY_BUNDLE - _LESS_FOR_A_VISIT * self.visits:
             return "stream", False
         saved = self.visits * (1 - self.shared / _SHARED_WHEN_SORTED)
         return "bundle", saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
