@@ -61,16 +61,16 @@ inline ulong chunk_first(ulong chunk, ulong n) { return chunk * n / CHUNKS; }
 // Chunk of this work-item: first, and last + 1.
 inline ulong chunk_begin(ulong n) { return chunk_first(get_global_id(0), n); }
 inline ulong chunk_end(ulong n) { return chunk_first(get_global_id(0) + 1, n); }
+#endif
 
-// The box around those of all chunks, each a low and a high corner.
-inline void enclose_chunks(global const float4 *boxes, float4 *low, float4 *high)
+// The box around `count` boxes, each a low and a high corner.
+inline void enclose_boxes(global const float4 *boxes, uint count, float4 *low, float4 *high)
 {
     *low = INFINITY;
     *high = -INFINITY;
-    for (uint chunk = 0; chunk < CHUNKS; chunk++) {
-        const float4 a = boxes[2 * chunk], b = boxes[2 * chunk + 1];
+    for (uint i = 0; i < count; i++) {
+        const float4 a = boxes[2 * i], b = boxes[2 * i + 1];
         *low = a < *low ? a : *low;
         *high = b > *high ? b : *high;
     }
 }
-#endif

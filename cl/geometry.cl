@@ -4,6 +4,7 @@
 //   triangles  three float4 a triangle: v0, v1, v2, w unused
 //   bounds       cl/bounds.h, for tests of scattered triangles
 //   bound_rows   the same per block of 16 triangles, a float16 each; for runs
+//   middles      boxes around parts of the scene, low and high corner, for cells to divide
 // All are padded to whole blocks; padding has radius -inf, which no test of cl/node.h keeps.
 //
 // Spheres are minimal (design, section 5): the circumcircle's, or that of the longest edge where the
@@ -82,21 +83,37 @@ inline float4 half_extents(float4 a, float4 b, float4 c, float4 sphere)
     return result;
 }
 
-// One work-item gathers GATHERED triangles; padding is zero.
+inline float4 vertex(global const float *vertices, uint number)
+{
+    global const float *p = vertices + 3 * (ulong)number;
+    return (float4)(p[0], p[1], p[2], 0.0f);
+}
+
+// One work-item gathers GATHERED triangles; padding is zero. middles[2 * item]: the box around twice the
+// middles of these triangles' boxes; inf, -inf where there are none.
 kernel void gather_triangles(const uint num_triangles, const uint padded,
                              global const float *restrict vertices,
-                             global const uint *restrict faces, global float4 *restrict triangles)
+                             global const uint *restrict faces, global float4 *restrict triangles,
+                             global float4 *restrict middles)
 {
     const uint begin = GATHERED * get_global_id(0), end = MIN(begin + GATHERED, padded);
-    for (uint i = begin; i < end; i++)
-        for (uint corner = 0; corner < 3; corner++) {
-            float4 v = 0.0f;
-            if (i < num_triangles) {
-                global const float *p = vertices + 3 * (ulong)faces[3 * (ulong)i + corner];
-                v = (float4)(p[0], p[1], p[2], 0.0f);
-            }
-            triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = v;
-        }
+    float4 lowest = INFINITY, highest = -INFINITY;
+    for (uint i = begin; i < MIN(end, num_triangles); i++) {
+        global const uint *face = faces + 3 * (ulong)i;
+        const float4 a = vertex(vertices, face[0]), b = vertex(vertices, face[1]),
+                     c = vertex(vertices, face[2]);
+        global float4 *triangle = triangles + TRIANGLE_FLOAT4S * (ulong)i;
+        triangle[0] = a, triangle[1] = b, triangle[2] = c;
+        const float4 ab_low = a < b ? a : b, ab_high = a > b ? a : b;
+        const float4 middle = (ab_low < c ? ab_low : c) + (ab_high > c ? ab_high : c);
+        lowest = middle < lowest ? middle : lowest;
+        highest = middle > highest ? middle : highest;
+    }
+    for (uint i = MAX(begin, num_triangles); i < end; i++)
+        for (uint corner = 0; corner < 3; corner++)
+            triangles[TRIANGLE_FLOAT4S * (ulong)i + corner] = 0.0f;
+    middles[2 * get_global_id(0)] = lowest;
+    middles[2 * get_global_id(0) + 1] = highest;
 }
 
 // One work-item bounds one block of 16 triangles.

@@ -31,27 +31,6 @@ inline void double_middles(uint block, uint num_triangles, global const float4 *
         middle[axis] = b.low[axis] + b.high[axis];
 }
 
-// The box around the doubled middles of each chunk.
-kernel void bound_middles(const uint num_triangles, global const float4 *restrict triangles,
-                          global float4 *restrict boxes)
-{
-    const uint num_blocks = (num_triangles + 15) / 16;
-    float16 low[3], high[3];
-    for (uint axis = 0; axis < 3; axis++)
-        low[axis] = INFINITY, high[axis] = -INFINITY;
-    for (uint block = chunk_begin(num_blocks), end = chunk_end(num_blocks); block < end; block++) {
-        float16 m[3];
-        double_middles(block, num_triangles, triangles, m);
-        for (uint axis = 0; axis < 3; axis++) {
-            low[axis] = m[axis] < low[axis] ? m[axis] : low[axis];
-            high[axis] = m[axis] > high[axis] ? m[axis] : high[axis];
-        }
-    }
-    global float4 *box = boxes + 2 * get_global_id(0);
-    box[0] = (float4)(lowest(low[0]), lowest(low[1]), lowest(low[2]), 0.0f);
-    box[1] = -(float4)(lowest(-high[0]), lowest(-high[1]), lowest(-high[2]), 0.0f);
-}
-
 // Cells of the cube around all middles. What is no number, where the cube has no size, is in the last.
 inline uint16 cell(float16 offset, float cells)
 {
@@ -62,11 +41,12 @@ inline uint16 cell(float16 offset, float cells)
 // Places along the curve. Lanes beyond the last triangle are as far along as it goes, and stay
 // behind it: the sort is stable.
 kernel void place_triangles(const uint num_triangles, global const float4 *restrict triangles,
-                            global const float4 *restrict boxes, global uint16 *restrict keys)
+                            const uint num_boxes, global const float4 *restrict middles,
+                            global uint16 *restrict keys)
 {
     const uint num_blocks = (num_triangles + 15) / 16;
     float4 low, high;
-    enclose_chunks(boxes, &low, &high);
+    enclose_boxes(middles, num_boxes, &low, &high);
     const float4 size = high - low;
     const float largest = largest3(size);
     const float cells = (1 << CELL_BITS) / largest;

@@ -28,6 +28,9 @@ class Geometry:
         first asked for after an update, in the same arrays.
     bound_rows : Array of shape (num_blocks, 12, 16) float32
         The same as rows of 16 triangles.
+    middles : Array of shape (m, 2, 4) float32
+        Boxes that hold twice the middles of the triangles' boxes, a part of the triangles each:
+        low and high corner.
     geom_ids : Array of shape (num_triangles,) uint32
     first_prims : Array of shape (num_meshes + 1,) uint32
         First flat triangle of each mesh.
@@ -43,6 +46,8 @@ class Geometry:
         self.geom_ids = session.upload(GEOMETRY, scene.geom_ids.astype(np.uint32))
         self.first_prims = session.upload(GEOMETRY, scene.first_prims.astype(np.uint32))
         self.triangles = session.empty((self._num_blocks * _BLOCK, 12), np.float32)
+        self._gatherers = -(-self._num_blocks * _BLOCK // _GATHERED)
+        self.middles = session.empty((self._gatherers, 2, 4), np.float32)
         self._bounds, self._bounds_version = None, None
         self._kernels = session.kernels("geometry.cl", GATHERED=_GATHERED)
         self.update(scene.vertices)
@@ -67,12 +72,13 @@ class Geometry:
         self.session.launch(
             GEOMETRY,
             self._kernels["gather_triangles"],
-            -(-padded // _GATHERED),
+            self._gatherers,
             np.uint32(self.num_triangles),
             np.uint32(padded),
             self._vertices,
             self.faces,
             self.triangles,
+            self.middles,
         )
 
     def _current_bounds(self):

@@ -54,8 +54,7 @@ class SceneTree:
     def __init__(self, session, geometry, builder="fast", memory_limit=None):
         check_choice("builder", builder, BUILDERS)
         self.session, self.geometry = session, geometry
-        self._chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
-        self._launch = _launcher(session, self._chunks)
+        self._launch = _launcher(session, _CHUNKS_PER_UNIT * session.device.max_compute_units)
         count = geometry.num_triangles
         if builder == "fast":
             self._builder = _RunBuilder(count, self._launch)
@@ -73,7 +72,6 @@ class SceneTree:
             )
         self.nodes = session.empty((num_nodes, _NODE_ROWS, _WIDTH), np.float32)
         self.leaves = session.empty((num_leaves, _LEAF_ROWS, _WIDTH), np.float32)
-        self._boxes = session.empty((self._chunks, 2, 4), np.float32)
         self._keys = session.empty(padded, np.uint32)
         identity = np.arange(padded, dtype=np.uint32)
         self._identity = session.upload(HIERARCHY_CREATION, identity)
@@ -88,8 +86,9 @@ class SceneTree:
         count, triangles = np.uint32(self.geometry.num_triangles), self.geometry.triangles
         if count == 0:
             return self._keys, self._identity
-        self._launch("bound_middles", count, triangles, self._boxes)
-        self._launch("place_triangles", count, triangles, self._boxes, self._keys)
+        middles = self.geometry.middles
+        boxes = np.uint32(middles.shape[0])
+        self._launch("place_triangles", count, triangles, boxes, middles, self._keys)
         with self.session.clock.under(HIERARCHY_CREATION):
             return sort_by_key(
                 self.session, self._keys, self._identity, _KEY_BITS, digit_bits=_DIGIT_BITS

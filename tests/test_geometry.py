@@ -65,6 +65,16 @@ def test_triangles_are_gathered_and_padding_has_no_radius(session, rng, count):
     assert len(padding) == -count % 16 and np.isneginf(padding[:, 3]).all()
 
 
+@pytest.mark.parametrize("count", [*COUNTS, 1023, 1024, 1025, 3001])
+def test_middles_hold_those_of_all_boxes_and_no_more(session, rng, count):
+    scene = triangle_soup(rng, count)
+    boxes = Geometry(session, scene).middles.get()[..., :3]
+    corners = scene.vertices[scene.faces]
+    middles = corners.min(axis=1) + corners.max(axis=1)
+    np.testing.assert_array_equal(boxes[:, 0].min(axis=0), middles.min(axis=0))
+    np.testing.assert_array_equal(boxes[:, 1].max(axis=0), middles.max(axis=0))
+
+
 @pytest.mark.parametrize("offset", [0.0, 1000.0])
 def test_spheres_hold_their_triangles_and_are_minimal(session, rng, offset):
     corners = (rng.random((500, 3, 3)) + offset).astype(np.float32)
