@@ -64,7 +64,7 @@ inline ulong chunk_end(ulong n) { return chunk_first(get_global_id(0) + 1, n); }
 #endif
 
 // The box around `count` boxes, each a low and a high corner.
-inline void enclose_boxes(global const float4 *boxes, uint count, float4 *low, float4 *high)
+inline void join_boxes(global const float4 *boxes, uint count, float4 *low, float4 *high)
 {
     *low = INFINITY;
     *high = -INFINITY;

@@ -40,7 +40,7 @@ kernel void make_grid(const uint resolution, global const float4 *restrict boxes
                       global float4 *restrict grid)
 {
     float4 low, high;
-    enclose_boxes(boxes, CHUNKS, &low, &high);
+    join_boxes(boxes, CHUNKS, &low, &high);
     const float4 extent = high - low;
     float edge = largest3(extent);
     edge = edge > SMALLEST_BOX ? edge : SMALLEST_BOX;

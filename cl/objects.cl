@@ -386,7 +386,7 @@ kernel void make_keys(const uint num_blocks, const float oversize,
                       global const float4 *restrict boxes, global uint16 *restrict keys)
 {
     float4 low, high;
-    enclose_boxes(boxes, CHUNKS, &low, &high);
+    join_boxes(boxes, CHUNKS, &low, &high);
     const float4 size = high - low;
     const float largest = largest3(size);
     const float cells = (1 << CELL_BITS) / largest, limit = oversize * largest;

@@ -78,7 +78,56 @@ inline bool pack_rays16(const Given *g, ulong i, global float4 *org_tnear, globa
     return MASK16(good) == 0xffff && directions == TRIPLES;
 }
 
-// facts[chunk]: the smallest index of a ray that is refused, INVALID where there is none.
+// The smallest index of a ray of a chunk that is refused, INVALID where there is none.
+inline uint pack_chunk(const Given *g, uint num_rays, global float4 *org_tnear, global float4 *dir_tfar)
+{
+    const ulong runs = num_rays / 16, stop = 16 * chunk_end(runs);
+    uint first = INVALID;
+    for (ulong i = 16 * chunk_begin(runs); i < stop; i += 16)
+        if (!pack_rays16(g, i, org_tnear, dir_tfar) && first == INVALID)
+            for (first = i; pack_ray(g, first, org_tnear, dir_tfar);)
+                first++;
+    if (get_global_id(0) == CHUNKS - 1)
+        for (ulong i = 16 * runs; i < num_rays; i++)
+            if (!pack_ray(g, i, org_tnear, dir_tfar))
+                first = MIN(first, i);
+    return first;
+}
+
+inline float square(float x) { return x * x; }
+
+// How far ray j is from ray i.
+inline float gap(const Given *g, ulong i, ulong j)
+{
+    float sum = 0.0f;
+    for (uint k = 0; k < 3; k++)
+        sum += square(g->origins[3 * j + k] - g->origins[3 * i + k])
+               + square(g->directions[3 * j + k] - g->directions[3 * i + k]);
+    return sum;
+}
+
+// The length of the rows where rays are those of a screen, pixel by pixel and row by row, else 0. Along a
+// row each is near the one before, like the second to the first; it ends where one is not; and each
+// row starts near the start of the row before.
+inline uint find_rows(const Given *g, uint num_rays)
+{
+    if (num_rays < LEAST_SIDE * LEAST_SIDE)
+        return 0;
+    const float near = FARTHEST * FARTHEST * gap(g, 0, 1);
+    const uint longest = num_rays / LEAST_SIDE;
+    uint length = 1;
+    while (length <= longest && gap(g, length - 1, length) <= near)
+        length++;
+    if (length < LEAST_SIDE || length > longest || num_rays % length != 0)
+        return 0;
+    for (ulong i = length; i < num_rays; i += length)
+        if (!(gap(g, i - length, i) <= near))
+            return 0;
+    return length;
+}
+
+// Work-item c < CHUNKS packs a chunk: facts[c] is the first ray that is refused, INVALID where there is none.
+// One more finds rows meanwhile: facts[CHUNKS].
 kernel void pack_rays(const uint num_rays, global const float *restrict origins,
                       global const float *restrict directions, global const float *restrict tnear,
                       const uint tnear_stride, global const float *restrict tfar,
@@ -86,48 +135,9 @@ kernel void pack_rays(const uint num_rays, global const float *restrict origins,
                       global float4 *restrict dir_tfar, global uint *restrict facts)
 {
     const Given given = {origins, directions, tnear, tfar, tnear_stride, tfar_stride};
-    const ulong runs = num_rays / 16, stop = 16 * chunk_end(runs);
-    uint first = INVALID;
-    for (ulong i = 16 * chunk_begin(runs); i < stop; i += 16)
-        if (!pack_rays16(&given, i, org_tnear, dir_tfar) && first == INVALID)
-            for (first = i; pack_ray(&given, first, org_tnear, dir_tfar);)
-                first++;
-    if (get_global_id(0) == CHUNKS - 1)
-        for (ulong i = 16 * runs; i < num_rays; i++)
-            if (!pack_ray(&given, i, org_tnear, dir_tfar))
-                first = MIN(first, i);
-    facts[get_global_id(0)] = first;
-}
-
-inline float square(float4 v) { return v.x * v.x + v.y * v.y + v.z * v.z; }
-
-// How far ray j is from ray i.
-inline float gap(global const float4 *org_tnear, global const float4 *dir_tfar, ulong i, ulong j)
-{
-    return square(org_tnear[j] - org_tnear[i]) + square(dir_tfar[j] - dir_tfar[i]);
-}
-
-// One work-item. facts[CHUNKS]: the length of the rows where rays are those of a screen, pixel by pixel
-// and row by row, else 0. Along a row each is near the one before, like the second to the first; it ends
-// where one is not; and each row starts near the start of the row before.
-kernel void find_rows(const uint num_rays, global const float4 *restrict org_tnear,
-                      global const float4 *restrict dir_tfar, global uint *restrict facts)
-{
-    global uint *row = facts + CHUNKS;
-    *row = 0;
-    if (num_rays < LEAST_SIDE * LEAST_SIDE)
-        return;
-    const float near = FARTHEST * FARTHEST * gap(org_tnear, dir_tfar, 0, 1);
-    const uint longest = num_rays / LEAST_SIDE;
-    uint length = 1;
-    while (length <= longest && gap(org_tnear, dir_tfar, length - 1, length) <= near)
-        length++;
-    if (length < LEAST_SIDE || length > longest || num_rays % length != 0)
-        return;
-    for (ulong i = length; i < num_rays; i += length)
-        if (!(gap(org_tnear, dir_tfar, i - length, i) <= near))
-            return;
-    *row = length;
+    const uint item = get_global_id(0);
+    facts[item] = item < CHUNKS ? pack_chunk(&given, num_rays, org_tnear, dir_tfar)
+                                : find_rows(&given, num_rays);
 }
 
 // Rays from the camera through every pixel, row by row from the top: direction = forward + sx right

@@ -46,7 +46,7 @@ kernel void place_triangles(const uint num_triangles, global const float4 *restr
 {
     const uint num_blocks = (num_triangles + 15) / 16;
     float4 low, high;
-    enclose_boxes(middles, num_boxes, &low, &high);
+    join_boxes(middles, num_boxes, &low, &high);
     const float4 size = high - low;
     const float largest = largest3(size);
     const float cells = (1 << CELL_BITS) / largest;

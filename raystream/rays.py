@@ -103,13 +103,19 @@ def _pack(session, count, origins, directions, tnear, tfar):
         return packed, 0
     chunks = _chunks(session)
     facts = session.empty(chunks + 1, np.uint32)
-    stream = packed.org_tnear, packed.dir_tfar
-
-    def launch(kernel, items, *args):
-        session.launch(RAY_CREATION, _kernels(session)[kernel], items, np.uint32(count), *args)
-
-    launch("pack_rays", chunks, origins, directions, *tnear, *tfar, *stream, facts)
-    launch("find_rows", 1, *stream, facts)
+    session.launch(
+        RAY_CREATION,
+        _kernels(session)["pack_rays"],
+        chunks + 1,
+        np.uint32(count),
+        origins,
+        directions,
+        *tnear,
+        *tfar,
+        packed.org_tnear,
+        packed.dir_tfar,
+        facts,
+    )
     *refused, width = facts.get().tolist()  # waits: shared arrays may change from here on
     packed.size = (width, count // width) if width else None
     return packed, min(refused)
