@@ -10,6 +10,7 @@
 
 #define LEAST_SIDE 8  // of a screen
 #define FARTHEST 4.0f // neighbours may be so much farther apart than the first two
+#define ROWS_AHEAD 16  // nobody has read them yet
 #define TRIPLES 0x1111u // the first of every four bits
 
 // A caller's arrays. A stride is 1, or 0 where all rays share one value.
@@ -120,9 +121,13 @@ inline uint find_rows(const Given *g, uint num_rays)
         length++;
     if (length < LEAST_SIDE || length > longest || num_rays % length != 0)
         return 0;
-    for (ulong i = length; i < num_rays; i += length)
+    for (ulong i = length; i < num_rays; i += length) {
+        const ulong ahead = 3 * MIN(i + ROWS_AHEAD * length, num_rays - 1);
+        PREFETCH(g->origins + ahead);
+        PREFETCH(g->directions + ahead);
         if (!(gap(g, i - length, i) <= near))
             return 0;
+    }
     return length;
 }
 

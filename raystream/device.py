@@ -28,12 +28,12 @@ def devices():
     list of pyopencl.Device
         In the order of the platforms; empty where there is none.
     """
-    pocl.pin_threads()
-    try:
-        platforms = cl.get_platforms()
-    except cl.Error:  # the loader raises where no platform is installed
-        return []
-    return [device for platform in platforms for device in platform.get_devices()]
+    with pocl.arranged_threads():
+        try:
+            platforms = cl.get_platforms()
+        except cl.Error:  # the loader raises where no platform is installed
+            return []
+        return [device for platform in platforms for device in platform.get_devices()]
 
 
 def default_device():
@@ -259,6 +259,13 @@ class Session:
             return self.upload(stage, array)
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
         return cl.Buffer(self.context, flags, hostbuf=np.ascontiguousarray(array))
+
+    def fetch(self, stage, array):
+        """A numpy array that holds what `array` does, once the queue has been waited for."""
+        target = np.empty(array.shape, array.dtype)
+        event = cl.enqueue_copy(self.queue, target, array.base_data, is_blocking=False)
+        self.clock.record(stage, event)
+        return target
 
     def download(self, *arrays):
         """Device arrays, which the caller gives up, as numpy arrays; waits for the launches.

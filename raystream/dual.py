@@ -7,6 +7,7 @@ see `_Coherence.choice`.
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 import pyopencl.array as cla
@@ -165,13 +166,13 @@ class DualTracer:
         self._trees = _Trees(session, geometry, memory_limit, builder)
 
     def intersect(self, rays):
-        """Closest hits of `rays`; returns (HitStream, Statistics)."""
+        """Closest hits of `rays`; returns (HitStream, function that waits for the Statistics)."""
         records = self.session.empty((len(rays), 4), np.float32)
         statistics = self._trace("intersect", rays, records)
         return HitStream.unpack(self.session, records), statistics
 
     def occluded(self, rays):
-        """Whether anything lies in each ray's segment; returns (uint8 Array, Statistics)."""
+        """Whether anything lies in each ray's segment; returns (uint8 Array, as `intersect`)."""
         blocked = self.session.empty(len(rays), np.uint8)
         return blocked, self._trace("occlude", rays, blocked)
 
@@ -182,7 +183,9 @@ class DualTracer:
     def _trace(self, query, rays, result):
         plan = self._plan(query, rays, result)
         self._trees.expect(plan.visits * len(rays))
-        return self._statistics(self._run(query, plan, rays, result))
+        sums, tree = self._run(query, plan, rays, result), self.tree()
+        facts = self._trees.geometry.num_triangles, tree.structure_bytes
+        return functools.partial(_statistics, self.session.queue, sums, *facts)
 
     def _plan(self, query, rays, result):
         """How to trace these rays, and in which order.
@@ -202,13 +205,20 @@ class DualTracer:
         return _Plan(traversal, given, visits)
 
     def _coherence(self, query, plan, rays, result):
-        counts = self._run(query, plan, rays, result, most=_SAMPLES)
+        sums = self._run(query, plan, rays, result, most=_SAMPLES)
+        counts = _by_name(self.session.queue, sums)
         visits = counts["nodes"] + counts["leaves"]
         places = min(plan.slots.shape[0], _SAMPLES * _RAYS)
         return _Coherence(visits / places, counts["boxes"] / max(1, visits))
 
     def _run(self, query, plan, rays, result, most=None):
-        """Trace the rays, or up to `most` work-items' spread evenly; returns the counts."""
+        """Trace the rays, or up to `most` work-items' spread evenly.
+
+        Returns
+        -------
+        ndarray of shape (9,) uint64
+            `_COUNTS`, there when the queue is done.
+        """
         num_slots = plan.slots.shape[0]
         size = self._stream_size(num_slots) if plan.traversal == "stream" else _RAYS
         groups = -(-num_slots // size)
@@ -229,7 +239,7 @@ class DualTracer:
             counts,
             result,
         )
-        return dict(zip(_COUNTS, sum_counts(self.session, counts), strict=True))
+        return sum_counts(self.session, counts)
 
     def _stream_size(self, num_rays):
         """Rays to a stream."""
@@ -237,20 +247,28 @@ class DualTracer:
         power = 1 << max(0, share.bit_length() - 1)
         return min(max(power, _LEAST_STREAM), _LONGEST_STREAM)
 
-    def _statistics(self, counts):
-        levels = [
-            {"nodes": nodes, "tests": tests, "hits": hits, "misses": tests - hits}
-            for nodes, tests, hits in (
-                (counts["nodes"], counts["box_tests"], counts["boxes"]),
-                (counts["leaves"], counts["leaf_tests"], counts["leaf_boxes"]),
-            )
-        ]
-        return Statistics(
-            levels=levels,
-            final_tests=counts["tests"],
-            final_hits=counts["hits"],
-            rays=counts["rays"],
-            triangles=self._trees.geometry.num_triangles,
-            batches=1,
-            structure_bytes=self.tree().structure_bytes,
+
+def _by_name(queue, sums):
+    queue.finish()
+    return dict(zip(_COUNTS, sums.tolist(), strict=True))
+
+
+# Of no session, which must go with its thread.
+def _statistics(queue, sums, num_triangles, structure_bytes):
+    counts = _by_name(queue, sums)
+    levels = [
+        {"nodes": nodes, "tests": tests, "hits": hits, "misses": tests - hits}
+        for nodes, tests, hits in (
+            (counts["nodes"], counts["box_tests"], counts["boxes"]),
+            (counts["leaves"], counts["leaf_tests"], counts["leaf_boxes"]),
         )
+    ]
+    return Statistics(
+        levels=levels,
+        final_tests=counts["tests"],
+        final_hits=counts["hits"],
+        rays=counts["rays"],
+        triangles=num_triangles,
+        batches=1,
+        structure_bytes=structure_bytes,
+    )

@@ -134,15 +134,15 @@ def split_ids(session, hits, geometry):
 
 
 def sum_counts(session, counts):
-    """The sums of the columns of counts, a uint64 array of shape (n, k), as integers.
+    """The sums of the columns of counts, (n, k) uint64: uint64 numpy, there when the queue is done.
 
-    Waits for the device, which has them ready by then: on the host it would take 0.2 ms.
+    On the host, of a thousand rows, they would take 0.2 ms.
     """
     sums = session.empty(counts.shape[1], np.uint64)
     sizes = map(np.uint32, counts.shape)
     kernel = _kernels(session)["sum_counts"]
     session.launch(FINAL_INTERSECTION, kernel, 1, *sizes, counts, sums)
-    return sums.get().tolist()
+    return session.fetch(FINAL_INTERSECTION, sums)
 
 
 def _launch(session, kernel, *args):

@@ -48,19 +48,41 @@ def is_pocl(device):
     return device.platform.name == PLATFORM_NAME
 
 
-def pin_threads():
-    """Have PoCL, which must not have started yet, keep each of its threads on a core of its own.
+@contextlib.contextmanager
+def arranged_threads():
+    """Have PoCL, should it start inside, keep each of its threads on a core, and behind ours.
 
     A thread that is woken is put on the core of the one that wakes it, and on a machine at rest two
     threads may stay on one core for 10 ms while the other is idle: kernels of 4 ms took 8 in a loop
     with pauses. Nothing is done where ``$POCL_AFFINITY`` says what is wanted, or where PoCL's
     threads are not as many as the cores that this process may use: it takes the first ones.
+
+    On whichever core it is, the thread that launches kernels shares it with one of PoCL's, which at
+    each launch takes the core from it: until the kernel has ended nothing more is launched. As
+    batch work they do not.
     """
+    before = _threads()
+    if _has_a_thread_for_each_core():
+        os.environ.setdefault("POCL_AFFINITY", "1")
+    yield
+    # Where the system forbids it launches take longer; nothing else is lost.
+    with contextlib.suppress(OSError):
+        for thread in _threads() - before:
+            if len(os.sched_getaffinity(thread)) == 1:  # another platform's are not pinned
+                os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
+
+
+def _threads():
+    """Numbers of the threads of this process, where the system tells."""
+    folder = pathlib.Path("/proc/self/task")
+    return {int(task.name) for task in folder.iterdir()} if folder.is_dir() else set()
+
+
+def _has_a_thread_for_each_core():
     cores = str(os.cpu_count())
     threads = os.environ.get("POCL_MAX_PTHREAD_COUNT") or cores
     allowed = str(len(os.sched_getaffinity(0))) if hasattr(os, "sched_getaffinity") else None
-    if allowed == cores == threads:
-        os.environ.setdefault("POCL_AFFINITY", "1")
+    return allowed == cores == threads
 
 
 def name_target(device):

@@ -152,14 +152,23 @@ class StageClock:
 
     def take(self):
         """Seconds by stage since the last `take`; the events must have completed."""
-        stages, last_end = {}, None
-        for stage, event in self._events:
-            profile = event.profile
-            start, end = profile.start, profile.end
-            begin = profile.queued if last_end is None else last_end
-            seconds = stages.setdefault(stage, {"wall": 0.0, "device": 0.0})
-            seconds["device"] += (end - start) * 1e-9
-            seconds["wall"] += max(end - begin, end - start) * 1e-9
-            last_end = end
-        self._events.clear()
-        return stages
+        return seconds_by_stage(self.hand_over())
+
+    def hand_over(self):
+        """What has been recorded since, for `seconds_by_stage` to read later."""
+        events, self._events = self._events, []
+        return events
+
+
+def seconds_by_stage(events):
+    """Seconds by stage of (stage, event) pairs in the order of the queue, all completed."""
+    stages, last_end = {}, None
+    for stage, event in events:
+        profile = event.profile
+        start, end = profile.start, profile.end
+        begin = profile.queued if last_end is None else last_end
+        seconds = stages.setdefault(stage, {"wall": 0.0, "device": 0.0})
+        seconds["device"] += (end - start) * 1e-9
+        seconds["wall"] += max(end - begin, end - start) * 1e-9
+        last_end = end
+    return stages

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import inspect
 import weakref
 
@@ -19,7 +20,7 @@ from raystream.ldc import LayeredDepthCubeTracer
 from raystream.packet import PacketTracer
 from raystream.rsh import RayspaceTracer
 from raystream.scene import as_scene
-from raystream.statistics import Statistics
+from raystream.statistics import Statistics, seconds_by_stage
 
 _METHODS = {
     "brute": Brute,
@@ -108,12 +109,18 @@ class Tracer:
             check_count("memory_limit", memory_limit)
         self.scene = copy.copy(as_scene(scene))  # what is added to the scene later is not traced
         self.method = method
-        self.statistics = Statistics(triangles=self.scene.num_triangles)
+        self._statistics = Statistics(triangles=self.scene.num_triangles)
         self.device, self._memory_limit, self._options = device, memory_limit, options
         self._vertices, self._version = self.scene.vertices, 0
         self._used = np.zeros(len(self._vertices), bool)
         self._used[self.scene.faces] = True
         self._backend(devices.session(device))
+
+    @property
+    def statistics(self):
+        if callable(self._statistics):  # nobody has asked for them yet
+            self._statistics = self._statistics()
+        return self._statistics
 
     def intersect(self, origins, directions, tnear=0.0, tfar=np.inf):
         """Closest hits.
@@ -141,7 +148,7 @@ class Tracer:
         geom_id, prim_id = intersect.split_ids(session, hits, self.geometry(session))
         fields = (hits.t, prim_id, geom_id, hits.u, hits.v)
         hits = Hits(*(fields if on_device else session.download(*fields)))
-        self.statistics.stages = session.finish()
+        self._finish(session)
         return hits
 
     def occluded(self, origins, directions, tnear=0.0, tfar=np.inf):
@@ -158,7 +165,7 @@ class Tracer:
         if not on_device:
             (blocked,) = session.download(blocked)
             blocked = blocked.view(bool)
-        self.statistics.stages = session.finish()
+        self._finish(session)
         return blocked
 
     def update_vertices(self, vertices):
@@ -188,23 +195,29 @@ class Tracer:
         return self._backend(session).geometry
 
     def intersect_stream(self, session, stream):
-        """Closest hits of a ray stream on the device, as a HitStream; sets the counts."""
+        """Closest hits of a ray stream on the device, as a HitStream; sets `statistics`."""
         backend = self._backend(session)
         if len(stream) == 0 or self.scene.num_triangles == 0:
-            self.statistics = Statistics(triangles=self.scene.num_triangles)
+            self._statistics = Statistics(triangles=self.scene.num_triangles)
             keys = intersect.no_hits(session, len(stream))
             return intersect.resolve(session, keys, stream, backend.geometry.triangles)
-        hits, self.statistics = backend.method.intersect(stream)
+        hits, self._statistics = backend.method.intersect(stream)
         return hits
 
     def occluded_stream(self, session, stream):
-        """Any hit of a ray stream on the device, as a uint8 array; sets the counts."""
+        """Any hit of a ray stream on the device, as a uint8 array; sets `statistics`."""
         backend = self._backend(session)
         if len(stream) == 0 or self.scene.num_triangles == 0:
-            self.statistics = Statistics(triangles=self.scene.num_triangles)
+            self._statistics = Statistics(triangles=self.scene.num_triangles)
             return intersect.not_blocked(session, len(stream))
-        blocked, self.statistics = backend.method.occluded(stream)
+        blocked, self._statistics = backend.method.occluded(stream)
         return blocked
+
+    def _finish(self, session):
+        """Wait for the launches of a call; its statistics are read where they are asked for."""
+        session.queue.finish()
+        events = session.clock.hand_over()
+        self._statistics = functools.partial(_read_statistics, self._statistics, events)
 
     def _rays(self, on_device, origins, directions, tnear, tfar):
         """The session to work in and the packed rays; a caller's context is worked in directly."""
@@ -230,6 +243,13 @@ class Tracer:
             backend.geometry.update(self._vertices)
             backend.version = self._version
         return backend
+
+
+def _read_statistics(counts, events):
+    """The statistics of a call: counts as a method gave them, and the times of its events."""
+    statistics = counts() if callable(counts) else counts
+    statistics.stages = seconds_by_stage(events)
+    return statistics
 
 
 def _default_limit(method, device):

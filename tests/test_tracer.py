@@ -280,6 +280,20 @@ def test_a_mesh_added_to_the_scene_later_is_not_traced(rng):
     assert tracer.statistics.triangles == 20
 
 
+def test_statistics_are_those_of_the_last_call_whatever_ran_since(rng):
+    scene = triangle_soup(rng, 200)
+    one, other = rs.Tracer(scene), rs.Tracer(scene)
+    one.intersect(*random_rays(rng, 1000))
+    other.occluded(*random_rays(rng, 10_000))
+    assert one.statistics.rays == 1000 and other.statistics.rays == 10_000
+    assert one.statistics is one.statistics
+    for tracer in (one, other):
+        assert all(times["device"] > 0 for times in tracer.statistics.stages.values())
+    assert "final intersection" in one.statistics.stages
+    with pytest.raises(AttributeError):
+        one.statistics = None
+
+
 def test_a_finished_thread_leaves_nothing_behind(rng):
     import gc
     import weakref
