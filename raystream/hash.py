@@ -17,10 +17,12 @@ HASHES = {
     },
     # For `dual`: bundles of 64 gain less by the last bits than sorting by them takes.
     "coarse": {"COARSE_BITS": 2, "CELL_BITS": 4, "FINE_BITS": 2, "WIDE_BITS": 10, "END_BITS": 6},
+    # For its streams of thousands of rays: one pass of the sort.
+    "coarsest": {"COARSE_BITS": 1, "CELL_BITS": 2, "FINE_BITS": 0, "WIDE_BITS": 4, "END_BITS": 2},
 }
 DEFAULT_HASH = "octahedral"
 # Of a key; the paper's has the light's number on top.
-BITS = {"paper": 32, "octahedral": 24, "coarse": 20}
+BITS = {"paper": 32, "octahedral": 24, "coarse": 20, "coarsest": 8}
 _CHUNKS_PER_UNIT = 32
 _MEASURED_RUNS = 16  # of every so many runs of rays one is measured where a key need not be exact
 

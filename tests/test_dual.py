@@ -326,6 +326,19 @@ def test_auto_sorts_rays_whose_bundles_it_improves(rng, session):
     assert auto.statistics.levels == bundle.statistics.levels
 
 
+@pytest.mark.parametrize("count, is_sorted", [(20_000, False), (100_000, True)])
+def test_auto_sorts_streams_of_many_scattered_rays(count, is_sorted, rng):
+    """Visits enough for the sort of so many; the hits are those of the order given."""
+    scene, rays = triangle_soup(rng, 20_000, size=0.3), random_rays(rng, count)
+    auto, stream = (
+        rs.Tracer(scene, "dual", builder="fast", traversal=t) for t in ("auto", "stream")
+    )
+    assert_same_hits(auto.intersect(*rays), stream.intersect(*rays))
+    assert ("sorting" in auto.statistics.stages) == is_sorted
+    assert "sorting" not in stream.statistics.stages
+    assert auto.statistics.rays == stream.statistics.rays == count
+
+
 def test_the_better_builder_is_taken_for_many_rays(rng):
     """Where those since the last change are enough, or those of the frame before."""
     scene, rays = triangle_soup(rng, 1000), random_rays(rng, 1600)
