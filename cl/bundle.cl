@@ -9,13 +9,15 @@
 // that child as single rays. In a leaf, triangles whose box the intervals miss are dropped, the others
 // are tested with sixteen rays at once, or the few rays of a group one by one.
 //
-// Work-item g takes bundle g * stride; with a stride some bundles are traced to know the others by.
+// Work-item g takes bundle g * stride; with a stride above 1 bundles are a sample to know the others by,
+// and their rays are compared with their neighbours, too.
 
 #include "single.h"
 
 #define GROUPS 4 // of sixteen rays
 #define RAYS (16 * GROUPS)
 #define FEW 6 // rays that are better off alone
+#define CLOSE 0.9924f // directions: the square of the cosine of 5 degrees
 #define CLOSE_END(per_t, t) ((t) * (per_t) * OUTWARDS)
 
 typedef struct {
@@ -416,9 +418,23 @@ inline void walk_bundle(Bundle *b, const Tree *tree, Counts *c)
     }
 }
 
+#define NEXT(v) ((v).s123456789abcdeff)
+
+// Whether neighbours go nearly the same way says whether sorting will bring such rays together.
+inline void compare_neighbours(const Rays16 *r, Counts *c)
+{
+    const float16 x = NEXT(r->dx), y = NEXT(r->dy), z = NEXT(r->dz);
+    const float16 product = r->dx * x + r->dy * y + r->dz * z;
+    const float16 length2 = r->dx * r->dx + r->dy * r->dy + r->dz * r->dz;
+    const int16 close = (product > 0.0f) & (product * product >= CLOSE * length2 * NEXT(length2));
+    const uint active = MASK16(r->tfar >= r->tnear), pairs = active & active >> 1;
+    c->pairs += COUNT16(pairs);
+    c->close_pairs += COUNT16(pairs & MASK16(close));
+}
+
 inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, bool any,
                          global const uint *slots, global const float4 *org_tnear,
-                         global const float4 *dir_tfar)
+                         global const float4 *dir_tfar, bool sample, Counts *c)
 {
     Bounds bounds = {{INFINITY, INFINITY, INFINITY},
                      {-INFINITY, -INFINITY, -INFINITY},
@@ -432,6 +448,8 @@ inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, b
     for (uint g = 0; g < GROUPS; g++) {
         const Rays16 r = gather_rays(first + 16 * g, 1, stop, slots, org_tnear, dir_tfar);
         set_group(b->groups + g, &r, scene, &bounds);
+        if (sample)
+            compare_neighbours(&r, c);
         b->open |= (ulong)MASK16(r.tfar >= r.tnear) << 16 * g;
     }
     b->interval = interval_of(&bounds);
@@ -442,7 +460,8 @@ inline void start_bundle(Bundle *b, ulong first, ulong stop, const Box *scene, b
     {                                                                                              \
         BEGIN_TRAVERSAL                                                                            \
         Bundle b;                                                                                  \
-        start_bundle(&b, first, num_slots, &scene, ANY, slots, org_tnear, dir_tfar);               \
+        start_bundle(&b, first, num_slots, &scene, ANY, slots, org_tnear, dir_tfar, stride > 1,    \
+                     &c);                                                                          \
         c.rays = COUNT64(b.open);                                                                  \
         if (b.open != 0)                                                                           \
             walk_bundle(&b, &tree, &c);                                                            \

@@ -18,12 +18,12 @@ inline void prefetch_child(const Tree *tree, uint child)
 
 // Of a work-item: rays traced; visits of nodes, tests of their boxes, boxes entered; visits of leaves,
 // tests of their triangles' boxes, boxes entered; ray-triangle tests, hits within the segment as far
-// as it then reached.
+// as it then reached. Of bundles that are a sample: pairs of rays side by side, and those of close directions.
 typedef struct {
-    uint rays, nodes, box_tests, boxes, leaves, leaf_tests, leaf_boxes, tests, hits;
+    uint rays, nodes, box_tests, boxes, leaves, leaf_tests, leaf_boxes, tests, hits, pairs, close_pairs;
 } Counts;
 
-#define NUM_COUNTS 9
+#define NUM_COUNTS 11
 
 inline void store_counts(const Counts *c, global ulong *counts)
 {
@@ -37,6 +37,8 @@ inline void store_counts(const Counts *c, global ulong *counts)
     counts[6] = c->leaf_boxes;
     counts[7] = c->tests;
     counts[8] = c->hits;
+    counts[9] = c->pairs;
+    counts[10] = c->close_pairs;
 }
 
 // What every traversal takes, before its results.
@@ -52,7 +54,7 @@ inline void store_counts(const Counts *c, global ulong *counts)
     const uint stop = MIN(first + RAYS, num_slots);                                                \
     const Tree tree = {nodes, leaves};                                                             \
     const Box scene = scene_box(nodes);                                                            \
-    Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0};
+    Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
 
 // The ray in a slot, INVALID where there is none.
 inline uint ray_in_slot(global const uint *slots, uint num_slots, uint i,

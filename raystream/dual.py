@@ -28,7 +28,8 @@ _RAYS = 64  # to a work-item
 _LEAST_STREAM, _LONGEST_STREAM, _STREAMS_PER_UNIT = 1024, 8192, 16
 # In the order of `Counts` (cl/single.h).
 _COUNTS = (
-    "rays", "nodes", "box_tests", "boxes", "leaves", "leaf_tests", "leaf_boxes", "tests", "hits"
+    "rays", "nodes", "box_tests", "boxes", "leaves", "leaf_tests", "leaf_boxes", "tests", "hits",
+    "pairs", "close_pairs",
 )  # fmt: skip
 
 # Eight scenes of 24,000 to 331,000 triangles and 262,144 rays of five kinds, two cores: the better
@@ -39,16 +40,16 @@ _MORE_VISITS_IN_FAST = 1.6
 _ASSUMED_VISITS = 7  # of a ray, where they are not measured
 # See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
-# 1.008 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
-# 1.45). The more visits rays make, the fewer of them need to share one for sorted bundles to pay.
-# Sorted bundles share a visit among up to some 40 of their 64 rays; sorting takes as long as
-# bundles for 0.2 visits of each ray and 30,000. Streams of scattered rays that make many visits
+# 1.002 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
+# 1.12). Sorted bundles share a visit among up to some 40 of their 64 rays; sorting takes as long as
+# bundles for 0.1 visits of each ray and 30,000. Streams of scattered rays that make many visits
 # take 0.75 to 0.95 of the time when sorted, that included.
 _FEW_RAYS = 8192
 _SAMPLES = 32
-_SHARED_BY_BUNDLE, _LESS_FOR_A_VISIT = 5.2, 0.1
+_CLOSE_PAIRS = 0.75
+_SHARED_BY_BUNDLE, _SHARED_BY_CLOSE_BUNDLE = 5.5, 2.5
 _SHARED_WHEN_SORTED = 40
-_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.2, 30_000
+_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.1, 30_000
 _SHARED_BY_SCATTERED, _MANY_VISITS, _MANY_VISITS_OF_ANY = 2, 3, 250_000
 _HASHES = {"bundle": "coarse", "stream": "coarsest"}
 
@@ -64,19 +65,32 @@ class _Plan:
 
 @dataclasses.dataclass
 class _Coherence:
-    """Of bundles: visits of nodes and leaves for each ray, inactive ones too; rays sharing one."""
+    """Of bundles in the given order.
+
+    Attributes
+    ----------
+    visits : float
+        Of nodes and leaves, for each ray, inactive ones too.
+    shared : float
+        Rays that share a visit.
+    close : float
+        Share of neighbours whose directions are within 5 degrees.
+    """
 
     visits: float
     shared: float
+    close: float
 
     def choice(self, num_rays):
         """The traversal that suits so many rays, and whether they should be sorted for it.
 
         A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
         stream costs what each ray's nodes and leaves cost, almost whatever their order. So it
-        matters how many visits bundles make, and how many rays share one.
+        matters how many visits bundles make, and how many rays share one, or would if they were
+        sorted: where neighbours are close, sorting brings together what is close to both.
         """
-        if self.shared < _SHARED_BY_BUNDLE - _LESS_FOR_A_VISIT * self.visits:
+        few = _SHARED_BY_CLOSE_BUNDLE if self.close >= _CLOSE_PAIRS else _SHARED_BY_BUNDLE
+        if self.shared < few:
             many = _MANY_VISITS + _MANY_VISITS_OF_ANY / num_rays
             return "stream", self.shared < _SHARED_BY_SCATTERED and self.visits > many
         saved = self.visits * (1 - self.shared / _SHARED_WHEN_SORTED)
@@ -213,14 +227,16 @@ class DualTracer:
         counts = _by_name(self.session.queue, sums)
         visits = counts["nodes"] + counts["leaves"]
         places = min(plan.slots.shape[0], _SAMPLES * _RAYS)
-        return _Coherence(visits / places, counts["boxes"] / max(1, visits))
+        shared = counts["boxes"] / max(1, visits)
+        close = counts["close_pairs"] / max(1, counts["pairs"])
+        return _Coherence(visits / places, shared, close)
 
     def _run(self, query, plan, rays, result, most=None):
         """Trace the rays, or up to `most` work-items' spread evenly.
 
         Returns
         -------
-        ndarray of shape (9,) uint64
+        ndarray of shape (11,) uint64
             `_COUNTS`, there when the queue is done.
         """
         num_slots = plan.slots.shape[0]

@@ -326,6 +326,20 @@ def test_auto_sorts_rays_whose_bundles_it_improves(rng, session):
     assert auto.statistics.levels == bundle.statistics.levels
 
 
+@pytest.mark.parametrize("spread, traversal", [(0.001, "bundle"), (1.0, "stream")])
+def test_auto_takes_bundles_where_neighbours_are_close(spread, traversal, rng):
+    """A bundle is eight times eight rays from about one place, in one direction or in any."""
+    scene = triangle_soup(rng, 20_000, size=0.02)
+    origins, directions = (np.repeat(array, 8, axis=0) for array in random_rays(rng, 8000))
+    origins = origins + rng.normal(size=origins.shape, scale=1e-3)
+    directions = directions + rng.normal(size=origins.shape, scale=spread)
+    auto, stream = (
+        rs.Tracer(scene, "dual", builder="fast", traversal=t) for t in ("auto", "stream")
+    )
+    assert_same_hits(*(tracer.intersect(origins, directions) for tracer in (auto, stream)))
+    assert (auto.statistics.levels == stream.statistics.levels) == (traversal == "stream")
+
+
 @pytest.mark.parametrize("count, is_sorted", [(20_000, False), (100_000, True)])
 def test_auto_sorts_streams_of_many_scattered_rays(count, is_sorted, rng):
     """Visits enough for the sort of so many; the hits are those of the order given."""

@@ -42,6 +42,7 @@ KINDS = ("primary", "mirror", "bumpy", "shadow", "random")
 OPPONENTS = ("open3d", "mitsuba")  # the ratio is to the better of these
 ROUNDS = 5
 _PAUSE = 0.2  # seconds until the threads of the one before have stopped looking for work
+_WARM = 0.06  # seconds until a processor that has paused is as fast as it gets
 _BUMPINESS = 0.35  # of a normal of length 1
 _OFF_SURFACE = 1e-4  # of the scene's size: where secondary rays start
 
@@ -290,16 +291,19 @@ class _Answer:
 def in_turn(runners, call, rounds=ROUNDS):
     """Median seconds of `call(name, step)` for each, one after the other in every round.
 
-    Each runs twice in a row and the second is timed, as in a loop over frames: sleeping threads and
-    caches full of another's data are not what is compared.
+    Each runs for a while and then once more, which is timed, as in a loop over frames: sleeping
+    threads, a slow clock and caches full of another's data are not what is compared.
     """
     seconds = {name: [] for name in runners}
-    for turn in range(rounds):
+    for _ in range(rounds):
         for name in runners:
             time.sleep(_PAUSE)
-            call(name, 2 * turn)
+            step, begin = 0, time.perf_counter()
+            while step == 0 or time.perf_counter() - begin < _WARM:
+                call(name, step)
+                step += 1
             start = time.perf_counter()
-            call(name, 2 * turn + 1)
+            call(name, step)
             seconds[name].append(time.perf_counter() - start)
     return {name: float(np.median(s)) for name, s in seconds.items()}
 
