@@ -207,20 +207,18 @@ INLINE void store_lane(Group *g, uint lane, const Closest *hit)
     LANE(float, v) = hit->v;
 }
 
-inline SingleRay ray_of_lane(const Group *g, uint lane)
+inline BoxRay box_ray_of_lane(const Group *g, uint lane)
 {
-    SingleRay r;
+    BoxRay r;
     for (uint k = 0; k < 3; k++) {
-        r.box.inverse[k] = LANE(float, inverse[k]);
-        r.box.near[k] = LANE(float, near[k]);
-        r.box.far[k] = LANE(float, far[k]);
-        r.box.low_row[k] = r.box.inverse[k] < 0.0f ? 3 + k : k;
+        r.inverse[k] = LANE(float, inverse[k]);
+        r.near[k] = LANE(float, near[k]);
+        r.far[k] = LANE(float, far[k]);
+        r.low_row[k] = r.inverse[k] < 0.0f ? 3 + k : k;
     }
-    r.box.begin = LANE(float, begin);
-    r.box.end = LANE(float, end);
-    r.box.per_t = LANE(float, per_t);
-    r.frame = frame_of_lane(g, lane);
-    r.hit = hit_of_lane(g, lane);
+    r.begin = LANE(float, begin);
+    r.end = LANE(float, end);
+    r.per_t = LANE(float, per_t);
     return r;
 }
 
@@ -230,8 +228,9 @@ inline uint finish_alone(Group *g, uint mask, const Tree *tree, uint node, bool 
     uint hit = 0;
     for (; mask != 0; mask &= mask - 1) {
         const uint lane = LOWEST(mask);
-        SingleRay r = ray_of_lane(g, lane);
-        walk(&r, tree, node, any, c);
+        BoxRay box = box_ray_of_lane(g, lane);
+        LeafRay r = {frame_of_lane(g, lane), hit_of_lane(g, lane)};
+        walk(&box, &r, tree, node, any, c);
         store_lane(g, lane, &r.hit);
         hit |= (uint)(r.hit.key != MISS) << lane;
     }

@@ -20,7 +20,8 @@ typedef struct {
 } List;
 
 typedef struct {
-    SingleRay rays[RAYS];
+    BoxRay boxes[RAYS];
+    LeafRay rays[RAYS];
     uint ids[ROOM + 16];
     uchar entered[RAYS + 16];
     bool any;
@@ -48,24 +49,23 @@ inline uint compress_list(const Stream *s, List list, uint k, uint *out)
     return count;
 }
 
-// Where one hit is enough, a ray that has one enters no box from here on.
-inline void close(const Stream *s, SingleRay *r)
-{
-    if (s->any)
-        r->box.end = -INFINITY;
-}
+inline bool is_closed(const Stream *s, uint id) { return s->any && s->rays[id].hit.key != MISS; }
 
-inline bool is_closed(const Stream *s, const SingleRay *r) { return s->any && r->hit.key != MISS; }
+// Where one hit is enough, a ray that has one enters no box from here on.
+inline void close_ray(Stream *s, uint id)
+{
+    if (is_closed(s, id))
+        s->boxes[id].end = -INFINITY;
+}
 
 inline void finish_list(Stream *s, const Tree *tree, List list, Counts *c)
 {
     for (uint i = 0; i < list.count; i++) {
-        SingleRay *r = s->rays + s->ids[list.begin + i];
-        if (is_closed(s, r))
+        const uint id = s->ids[list.begin + i];
+        if (is_closed(s, id))
             continue;
-        walk(r, tree, list.node, s->any, c);
-        if (r->hit.key != MISS)
-            close(s, r);
+        walk(s->boxes + id, s->rays + id, tree, list.node, s->any, c);
+        close_ray(s, id);
     }
 }
 
@@ -77,10 +77,10 @@ inline uint push_children(Stream *s, const Tree *tree, List list, List *stack, u
     float8 sum = 0.0f;
     int8 count = 0;
     for (uint i = 0; i < list.count; i++) {
-        const SingleRay *r = s->rays + s->ids[list.begin + i];
-        PREFETCH_PRIVATE(s->rays + s->ids[list.begin + MIN(i + SOON, list.count - 1)]);
+        const BoxRay *r = s->boxes + s->ids[list.begin + i];
+        PREFETCH_PRIVATE(s->boxes + s->ids[list.begin + MIN(i + SOON, list.count - 1)]);
         float8 enter;
-        const int8 enters = enter_children(&r->box, rows, &enter);
+        const int8 enters = enter_children(r, rows, &enter);
         s->entered[i] = (uchar)MASK8(enters);
         sum += enters ? enter : 0.0f;
         count -= enters;
@@ -129,15 +129,16 @@ inline void test_list(Stream *s, List list, global const float8 *leaf, Counts *c
         const uint count = MIN(list.count - i, 16u);
         uint inside = 0;
         for (uint k = 0; k < count; k++)
-            PREFETCH_PRIVATE(&s->rays[ids[i + k]].frame);
+            PREFETCH_PRIVATE(s->rays + ids[i + k]);
         for (uint k = 0; k < count; k++)
             inside |= (uint)test_edges(&s->rays[ids[i + k]].frame, leaf, tests + k) << k;
         for (; inside != 0; inside &= inside - 1) {
             const uint k = LOWEST(inside);
-            SingleRay *r = s->rays + ids[i + k];
-            if (!is_closed(s, r) && finish_leaf(&r->frame, tests + k, &r->hit, leaf, c)) {
-                shorten_ray(r);
-                close(s, r);
+            const uint id = ids[i + k];
+            LeafRay *r = s->rays + id;
+            if (!is_closed(s, id) && finish_leaf(&r->frame, tests + k, &r->hit, leaf, c)) {
+                shorten_ray(s->boxes + id, r);
+                close_ray(s, id);
             }
         }
     }
@@ -176,8 +177,9 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
             const uint ray = ray_in_slot(slots, num_slots, i, org_tnear, dir_tfar);                \
             if (ray == INVALID)                                                                    \
                 continue;                                                                          \
-            SingleRay *r = s.rays + c.rays;                                                        \
-            set_single_ray(r, &scene, org_tnear[ray], dir_tfar[ray]);                              \
+            LeafRay *r = s.rays + c.rays;                                                          \
+            set_box_ray(s.boxes + c.rays, &scene, org_tnear[ray], dir_tfar[ray]);                  \
+            set_leaf_ray(r, org_tnear[ray], dir_tfar[ray]);                                        \
             if (is_active(r))                                                                      \
                 number[c.rays++] = ray;                                                            \
             else                                                                                   \
@@ -186,7 +188,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
         if (c.rays != 0)                                                                           \
             walk_stream(&s, c.rays, &tree, &c);                                                    \
         for (uint i = 0; i < c.rays; i++) {                                                        \
-            const SingleRay *r = s.rays + i;                                                       \
+            const LeafRay *r = s.rays + i;                                                       \
             STORE(number[i], r->frame.tfar, r->hit.u, r->hit.v, (uint)r->hit.key);                 \
         }                                                                                          \
         store_counts(&c, counts);                                                                  \

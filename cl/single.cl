@@ -17,10 +17,12 @@
             const uint ray = ray_in_slot(slots, num_slots, i, org_tnear, dir_tfar);                \
             if (ray == INVALID)                                                                    \
                 continue;                                                                          \
-            SingleRay r;                                                                           \
-            set_single_ray(&r, &scene, org_tnear[ray], dir_tfar[ray]);                             \
+            BoxRay box;                                                                            \
+            LeafRay r;                                                                             \
+            set_box_ray(&box, &scene, org_tnear[ray], dir_tfar[ray]);                              \
+            set_leaf_ray(&r, org_tnear[ray], dir_tfar[ray]);                                       \
             if (is_active(&r)) {                                                                   \
-                walk(&r, &tree, 0, ANY, &c);                                                       \
+                walk(&box, &r, &tree, 0, ANY, &c);                                                 \
                 c.rays++;                                                                          \
             }                                                                                      \
             STORE(ray, r.frame.tfar, r.hit.u, r.hit.v, (uint)r.hit.key);                           \

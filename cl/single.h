@@ -79,21 +79,20 @@ typedef struct {
     float u, v;
 } Closest;
 
+// A ray as leaves see it; nodes see its BoxRay. A cache line each.
 typedef struct {
-    BoxRay box;
     RayFrame frame;
     Closest hit;
-} __attribute__((aligned(64))) SingleRay; // the box in one cache line, the rest in the next
+} __attribute__((aligned(64))) LeafRay;
 
-inline void set_single_ray(SingleRay *r, const Box *scene, float4 org_tnear, float4 dir_tfar)
+inline void set_leaf_ray(LeafRay *r, float4 org_tnear, float4 dir_tfar)
 {
-    set_box_ray(&r->box, scene, org_tnear, dir_tfar);
     r->frame = ray_frame(org_tnear, dir_tfar);
     r->hit.key = MISS;
     r->hit.u = r->hit.v = 0.0f;
 }
 
-inline bool is_active(const SingleRay *r) { return r->frame.tfar >= r->frame.tnear; }
+inline bool is_active(const LeafRay *r) { return r->frame.tfar >= r->frame.tnear; }
 
 // A ray's edges and depths of a leaf's triangles.
 typedef struct {
@@ -150,37 +149,37 @@ INLINE bool test_leaf(const RayFrame *frame, Closest *hit, global const float8 *
 
 inline float distance_of(const Closest *hit) { return as_float((uint)(hit->key >> 32)); }
 
-// Equal distances still hit, and are still entered.
-inline void shorten_ray(SingleRay *r)
+// The ray goes no farther than its hit; equal distances still hit, and are still entered.
+inline void shorten_ray(BoxRay *box, LeafRay *r)
 {
     r->frame.tfar = distance_of(&r->hit);
-    r->box.end = r->frame.tfar * r->box.per_t * OUTWARDS;
+    box->end = r->frame.tfar * box->per_t * OUTWARDS;
 }
 
-inline void visit_leaf(SingleRay *r, global const float8 *leaf, Counts *c)
+inline void visit_leaf(BoxRay *box, LeafRay *r, global const float8 *leaf, Counts *c)
 {
     if (test_leaf(&r->frame, &r->hit, leaf, c))
-        shorten_ray(r);
+        shorten_ray(box, r);
 }
 
 // A child and where it is entered, ordered by the latter: s >= 0, so its bits sort like its value.
 inline ulong entry(float enter, uint child) { return ((ulong)as_uint(enter) << 32) | child; }
 
 // Walk the tree from `node`; where `any`, up to the first hit.
-inline void walk(SingleRay *r, const Tree *tree, uint node, bool any, Counts *c)
+inline void walk(BoxRay *box, LeafRay *r, const Tree *tree, uint node, bool any, Counts *c)
 {
     ulong stack[TREE_STACK];
     uint top = 0;
     for (;;) {
         if (node & LEAF) {
-            visit_leaf(r, tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS, c);
+            visit_leaf(box, r, tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS, c);
             if (any && r->hit.key != MISS)
                 return;
         } else {
             global const float8 *rows = tree->nodes + (ulong)node * TREE_ROWS;
             global const uint *children = (global const uint *)(rows + TREE_CHILD_ROW);
             float8 enter;
-            uint mask = MASK8(enter_children(&r->box, rows, &enter));
+            uint mask = MASK8(enter_children(box, rows, &enter));
             c->nodes++;
             c->box_tests += TREE_WIDTH;
             c->boxes += COUNT16(mask);
@@ -213,7 +212,7 @@ inline void walk(SingleRay *r, const Tree *tree, uint node, bool any, Counts *c)
             if (top == 0)
                 return;
             top--;
-        } while (as_float((uint)(stack[top] >> 32)) > r->box.end);
+        } while (as_float((uint)(stack[top] >> 32)) > box->end);
         node = (uint)stack[top];
     }
 }
