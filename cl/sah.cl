@@ -21,6 +21,9 @@
 //   up. Anything else leaves fewer leaves to a node of one level less than it may hold.
 //
 // Deterministic: which work-item takes a task decides nothing.
+//
+// Build-time constants: CHUNKS; CELL_BITS, of a place along an axis: keys have as many digits of three bits, an
+// octree level each.
 
 #include "tree_make.h"
 
@@ -29,7 +32,6 @@
 #define MOST_MOVED TREE_WIDTH // by rounding to whole leaves
 #define TASK_LEVELS 14
 #define TOP_LEVELS (TREE_DEPTH - TASK_LEVELS)
-#define KEY_DIGITS 10 // of three bits: an octree level each
 
 // A thing: -low x, y, z, its number; high x, y, z. Boxes are joined by `larger8`.
 #define NUMBER s3
@@ -401,19 +403,19 @@ kernel void cut_tasks(const uint num_triangles, const uint target, const uint fi
                       global const uint *restrict keys, global Task *restrict tasks,
                       global Tasks *restrict all)
 {
-    uint3 stack[7 * KEY_DIGITS + 1]; // begin, end, level
+    uint3 stack[7 * CELL_BITS + 1]; // begin, end, level
     uint top = 0, count = 0;
     stack[top++] = (uint3)(0, num_triangles, 0);
     while (top > 0) {
         const uint3 cell = stack[--top];
         if (cell.x == cell.y)
             continue;
-        if (cell.y - cell.x <= target || cell.z == KEY_DIGITS) {
+        if (cell.y - cell.x <= target || cell.z == CELL_BITS) {
             if (count == 0 || cell.y - tasks[count - 1].begin > target / 4)
                 tasks[count++].begin = cell.x;
             continue;
         }
-        const uint shift = 3 * (KEY_DIGITS - 1 - cell.z);
+        const uint shift = 3 * (CELL_BITS - 1 - cell.z);
         uint end = cell.y;
         for (uint digit = 8; digit-- > 0;) { // the first on top
             const uint begin = first_with(keys, cell.x, end, shift, digit);

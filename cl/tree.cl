@@ -8,12 +8,10 @@
 // A tree over n triangles has ceil(log8(n / 8)) levels, at least one: at most 10 for 2^31, below
 // TREE_DEPTH. Equal keys (all triangles in one point, duplicates) change the boxes, never the shape.
 //
-// Build-time constant: CHUNKS.
+// Build-time constants: CHUNKS; CELL_BITS, of a place along an axis.
 
 #include "hilbert.h"
 #include "tree_make.h"
-
-#define CELL_BITS 10 // an axis: keys of 30 bits
 
 // ---- the order ----
 

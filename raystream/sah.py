@@ -19,6 +19,8 @@ class SurfaceAreaBuilder:
     ----------
     session : raystream.device.Session
     num_triangles : int
+    cell_bits : int
+        Of a place along an axis, in the keys.
 
     Attributes
     ----------
@@ -28,7 +30,7 @@ class SurfaceAreaBuilder:
         Of the arrays that it works in.
     """
 
-    def __init__(self, session, num_triangles):
+    def __init__(self, session, num_triangles, cell_bits):
         self.session, self._count = session, num_triangles
         self._target = max(num_triangles // _TASK_SHARE, _LEAST_TASK)
         tasks = 2 * (num_triangles // (self._target // 4)) + 1
@@ -50,7 +52,7 @@ class SurfaceAreaBuilder:
         self._arrays = None
         units = session.device.max_compute_units
         self._chunks, self._workers = _CHUNKS_PER_UNIT * units, _WORKERS_PER_UNIT * units
-        self._kernels = session.kernels("sah.cl", CHUNKS=self._chunks)
+        self._kernels = session.kernels("sah.cl", CHUNKS=self._chunks, CELL_BITS=cell_bits)
 
     def build(self, triangles, keys, order, nodes, leaves):
         """Fill `nodes` and `leaves`.
@@ -60,7 +62,7 @@ class SurfaceAreaBuilder:
         triangles : Array
             Of the geometry.
         keys : Array of shape (n,) uint32
-            Places along a Hilbert curve of 10 bits an axis, ascending.
+            Places along a Hilbert curve of `cell_bits` an axis, ascending.
         order : Array of shape (n,) uint32
             The triangles at these places.
         nodes, leaves : Array

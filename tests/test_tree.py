@@ -6,6 +6,7 @@ from soup import mesh_of, triangle_soup
 
 import raystream as rs
 from raystream import device, program
+from raystream import tree as tree_module
 from raystream.errors import MemoryLimitError
 from raystream.geometry import Geometry
 from raystream.tree import BUILDERS, SceneTree
@@ -75,6 +76,20 @@ def check(tree, scene):
 def test_each_triangle_is_in_one_leaf_and_boxes_are_tight(session, rng, builder, count):
     scene = triangle_soup(rng, count, size=0.1)
     check(tree_of(session, scene, builder), scene)
+
+
+def test_many_triangles_take_finer_cells(session, rng, builder, monkeypatch):
+    """Of a cluster as wide as 1/512 of the scene keys of 8 bits an axis tell nothing apart."""
+    middles = 0.501 + rng.random((3001, 1, 3)) / 512
+    middles[:2] = np.float32([[[0, 0, 0]], [[1, 1, 1]]])
+    scene = scene_of(middles + 1e-6 * rng.normal(size=(3001, 3, 3)))
+    keys = []
+    for most in (3001, 3000):
+        monkeypatch.setattr(tree_module, "_MANY_TRIANGLES", most)
+        tree = tree_of(session, scene, builder)
+        check(tree, scene)
+        keys.append(len(np.unique(tree._sorted()[0].get()[:3001])))
+    assert keys[0] == 3 and keys[1] > 3
 
 
 DEGENERATE = {
