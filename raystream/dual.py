@@ -40,14 +40,14 @@ _MORE_VISITS_IN_FAST = 1.6
 _ASSUMED_VISITS = 7  # of a ray, where they are not measured
 # See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
-# 1.002 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
-# 1.12). Sorted bundles share a visit among up to some 40 of their 64 rays; sorting takes as long as
+# 1.01 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
+# 1.2). Sorted bundles share a visit among up to some 40 of their 64 rays; sorting takes as long as
 # bundles for 0.1 visits of each ray and 30,000. Streams of scattered rays that make many visits
 # take 0.75 to 0.95 of the time when sorted, that included.
 _FEW_RAYS = 8192
 _SAMPLES = 32
 _CLOSE_PAIRS = 0.75
-_SHARED_BY_BUNDLE, _SHARED_BY_CLOSE_BUNDLE = 5.5, 2.5
+_SHARED_BY_BUNDLE, _SHARED_BY_CLOSE_BUNDLE = 6.8, 2.5
 _SHARED_WHEN_SORTED = 40
 _VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.1, 30_000
 _SHARED_BY_SCATTERED, _MANY_VISITS, _MANY_VISITS_OF_ANY = 2, 3, 250_000
