@@ -188,7 +188,7 @@ inline void walk_stream(Stream *s, uint num_rays, const Tree *tree, Counts *c)
         if (c.rays != 0)                                                                           \
             walk_stream(&s, c.rays, &tree, &c);                                                    \
         for (uint i = 0; i < c.rays; i++) {                                                        \
-            const LeafRay *r = s.rays + i;                                                       \
+            const LeafRay *r = s.rays + i;                                                         \
             STORE(number[i], r->frame.tfar, r->hit.u, r->hit.v, (uint)r->hit.key);                 \
         }                                                                                          \
         store_counts(&c, counts);                                                                  \

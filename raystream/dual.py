@@ -201,8 +201,8 @@ class DualTracer:
     def _trace(self, query, rays, result):
         plan = self._plan(query, rays, result)
         self._trees.expect(plan.visits * len(rays))
-        sums, tree = self._run(query, plan, rays, result), self.tree()
-        facts = self._trees.geometry.num_triangles, tree.structure_bytes
+        sums = self._run(query, plan, rays, result)
+        facts = self._trees.geometry.num_triangles, self.tree().structure_bytes
         return functools.partial(_statistics, self.session.queue, sums, *facts)
 
     def _plan(self, query, rays, result):

@@ -18,8 +18,7 @@ _NODE_BYTES, _LEAF_BYTES = 4 * _NODE_ROWS * _WIDTH, 4 * _LEAF_ROWS * _WIDTH
 # surface: where there are many more triangles leaves grow, by 6 % with 871,414. Two passes of 12
 # bits take 0.85 of the time of three of 10 with 331,179 triangles.
 _MANY_TRIANGLES = 400_000
-_CELL_BITS, _DIGIT_BITS = 8, 12
-_CELL_BITS_OF_MANY, _DIGIT_BITS_OF_MANY = 10, 10
+_BITS, _BITS_OF_MANY = (8, 12), (10, 10)
 _BLOCK = 16
 _CHUNKS_PER_UNIT = 8
 
@@ -60,8 +59,7 @@ class SceneTree:
         self.session, self.geometry = session, geometry
         count = geometry.num_triangles
         many = count > _MANY_TRIANGLES
-        self._cell_bits = _CELL_BITS_OF_MANY if many else _CELL_BITS
-        self._digit_bits = _DIGIT_BITS_OF_MANY if many else _DIGIT_BITS
+        self._cell_bits, self._digit_bits = _BITS_OF_MANY if many else _BITS
         self._launch = _launcher(session, self._cell_bits)
         if builder == "fast":
             self._builder = _RunBuilder(count, self._launch)
