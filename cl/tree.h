@@ -12,7 +12,7 @@
 // tests a ray against a box pads the interval for the rounding of that test.
 //
 // Node 0 is the root, there always is one, also of a single triangle. No path from the root is longer than
-// TREE_DEPTH nodes whatever the scene (the builder proves it), hence a depth-first stack never holds more than
+// TREE_DEPTH nodes whatever the scene (the builders prove it), hence a depth-first stack never holds more than
 // TREE_STACK entries.
 
 #define TREE_WIDTH 8

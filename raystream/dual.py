@@ -36,7 +36,7 @@ _COUNTS = (
 # builder takes some 58 ns more for each triangle, and saves some 4 ns for each visit that bundles
 # in the given order make in the fast one's tree, where they make 1.6 times as many.
 _VISITS_WORTH_QUALITY = 14.5  # of a triangle
-_MORE_VISITS_IN_FAST = 1.6
+_MORE_VISITS_IN_FAST = 2
 _ASSUMED_VISITS = 7  # of a ray, where they are not measured
 # See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes

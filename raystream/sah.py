@@ -5,11 +5,12 @@ import numpy as np
 from raystream.statistics import HIERARCHY_CREATION
 
 _WIDTH = 8  # children of a node, triangles of a leaf: cl/tree.h
-# A task should be small enough to stay in a core's cache, and there must be enough of them to share
-# out evenly; the bound of 513 tasks (cl/sah.cl) follows from the second.
-_TASK_SHARE, _LEAST_TASK = 64, 512
-_CHUNKS_PER_UNIT = 8
+_LEAST_FILL = 4  # triangles to a leaf, on average: splits by surface area leave some 7
+# Tasks should be enough to share out evenly; smaller ones cost launches.
+_TASKS_PER_UNIT, _LEAST_TASK, _MOST_LEVELS = 8, 512, 8
+_PIECES_PER_UNIT, _MOST_PIECES = 8, 64
 _WORKERS_PER_UNIT = 4
+_TOP_BYTES, _BINS_BYTES, _TASK_WORDS = 96, 3 * 16 * 40, 11  # cl/sah.cl
 
 
 class SurfaceAreaBuilder:
@@ -18,9 +19,7 @@ class SurfaceAreaBuilder:
     Parameters
     ----------
     session : raystream.device.Session
-    num_triangles : int
-    cell_bits : int
-        Of a place along an axis, in the keys.
+    geometry : raystream.geometry.Geometry
 
     Attributes
     ----------
@@ -30,60 +29,53 @@ class SurfaceAreaBuilder:
         Of the arrays that it works in.
     """
 
-    def __init__(self, session, num_triangles, cell_bits):
-        self.session, self._count = session, num_triangles
-        self._target = max(num_triangles // _TASK_SHARE, _LEAST_TASK)
-        tasks = 2 * (num_triangles // (self._target // 4)) + 1
-        self._first_node = _nodes_over(tasks)  # behind those above the tasks
-        self.num_leaves = -(-num_triangles // _WIDTH) + tasks
-        self.num_nodes = self._first_node + _nodes_over(self.num_leaves) + tasks
+    def __init__(self, session, geometry):
+        self.session, self._geometry = session, geometry
+        count, units = geometry.num_triangles, session.device.max_compute_units
+        self._target = max(count // (_TASKS_PER_UNIT * units), _LEAST_TASK)
+        # Parts are not of one size: three levels more than halves would take.
+        halvings = (count // self._target).bit_length() - 1
+        self._levels = min(halvings + 3, _MOST_LEVELS) if count > self._target else 0
+        self._pieces = min(_PIECES_PER_UNIT * units, _MOST_PIECES)
+        self._workers = _WORKERS_PER_UNIT * units
+        tops = 2 << self._levels
+        self.num_leaves = count // _LEAST_FILL + tops
+        self.num_nodes = tops // 2 + 4 * self.num_leaves // 7 + 1
         self._shapes = {
-            "things": ((num_triangles, _WIDTH), np.float32),
-            "scratch": ((num_triangles, _WIDTH), np.float32),
-            "order": ((self.num_leaves + 1) // 2 * 2 * _WIDTH, np.uint32),
-            "roots": ((tasks, _WIDTH), np.float32),
-            "top_scratch": ((tasks, _WIDTH), np.float32),
-            "tasks": ((tasks + 1, 3), np.uint32),
-            "all": (3, np.uint32),
+            "even": ((count, 8), np.float32),
+            "odd": ((count, 8), np.float32),
+            "tops": ((tops, _TOP_BYTES), np.uint8),
+            "pieces": ((tops, self._pieces, 2), np.uint32),
+            "bins": ((max(1, tops // 4) * self._pieces, _BINS_BYTES), np.uint8),
+            "tasks": (2 + tops // 2 * _TASK_WORDS, np.uint32),
         }
         self.nbytes = sum(
             int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in self._shapes.values()
         )
         self._arrays = None
-        units = session.device.max_compute_units
-        self._chunks, self._workers = _CHUNKS_PER_UNIT * units, _WORKERS_PER_UNIT * units
-        self._kernels = session.kernels("sah.cl", CHUNKS=self._chunks, CELL_BITS=cell_bits)
+        self._kernels = session.kernels("sah.cl", PIECES=self._pieces, LEVELS=self._levels)
 
-    def build(self, triangles, keys, order, nodes, leaves):
-        """Fill `nodes` and `leaves`.
-
-        Parameters
-        ----------
-        triangles : Array
-            Of the geometry.
-        keys : Array of shape (n,) uint32
-            Places along a Hilbert curve of `cell_bits` an axis, ascending.
-        order : Array of shape (n,) uint32
-            The triangles at these places.
-        nodes, leaves : Array
-            As those of `SceneTree`, of `num_nodes` and `num_leaves`.
-        """
+    def build(self, nodes, leaves):
+        """Fill arrays of `num_nodes` and `num_leaves`, as those of `SceneTree`."""
         if self._arrays is None:
             self._arrays = {k: self.session.empty(*of) for k, of in self._shapes.items()}
-        a = self._arrays
-        sizes = map(np.uint32, (self._count, self._target, self._first_node))
-        self._launch("cut_tasks", 1, *sizes, keys, a["tasks"], a["all"])
+        a, geometry, target = self._arrays, self._geometry, np.uint32(self._target)
+        triangles, boxes = geometry.triangles, geometry.middles
+        splits, things = (a["tops"], a["pieces"]), (a["even"], a["odd"])
         self._launch(
-            "build_tasks", self._workers, order, triangles, a["tasks"], a["all"], a["things"],
-            a["scratch"], a["order"], nodes, a["roots"],
+            "start_build", self._pieces, np.uint32(geometry.num_triangles), target, triangles,
+            np.uint32(boxes.shape[0]), boxes, a["even"], *splits, a["bins"],
         )  # fmt: skip
-        self._launch("build_top", 1, a["all"], a["roots"], a["top_scratch"], nodes)
-        self._launch("fill_leaves", self._chunks, a["all"], a["order"], triangles, leaves)
+        for level in range(self._levels):
+            ranges, number = 1 << level, np.uint32(level)
+            self._launch("choose_planes", ranges, number, target, *splits, a["bins"])
+            source, to = things[level % 2], things[1 - level % 2]
+            size = ranges * self._pieces
+            self._launch("split_ranges", size, number, *splits, source, to, a["bins"])
+        self._launch("plan_tasks", 1, a["tops"], a["tasks"], nodes)
+        self._launch(
+            "build_tasks", self._workers, *splits, a["tasks"], triangles, *things, nodes, leaves
+        )
 
     def _launch(self, kernel, size, *args):
         self.session.launch(HIERARCHY_CREATION, self._kernels[kernel], size, *args)
-
-
-def _nodes_over(leaves):
-    """The most nodes over so many leaves: cl/sah.cl."""
-    return 4 * leaves // 7 + 1

@@ -32,7 +32,7 @@ class SceneTree:
     geometry : raystream.geometry.Geometry
     builder : {"fast", "quality"}
         "fast": leaves are runs of eight triangles along a Hilbert curve. "quality": splits by the
-        surface area heuristic; takes about three times as long, and rays visit fewer nodes.
+        surface area heuristic; takes about five times as long, and rays visit half the nodes.
     memory_limit : int, optional
         Bytes that the tree and what it is built in may take.
 
@@ -44,7 +44,7 @@ class SceneTree:
     leaves : Array of shape (num_leaves, 10, 8) float32
         Rows of eight lanes, a triangle each: three vertices, the flat triangle's number (uint32).
     structure_bytes : int
-        Of the tree and of what it is built in, without the arrays of the sort.
+        Of the tree and of what it is built in, without what the sort takes.
 
     Raises
     ------
@@ -58,17 +58,11 @@ class SceneTree:
         check_choice("builder", builder, BUILDERS)
         self.session, self.geometry = session, geometry
         count = geometry.num_triangles
-        many = count > _MANY_TRIANGLES
-        self._cell_bits, self._digit_bits = _BITS_OF_MANY if many else _BITS
-        self._launch = _launcher(session, self._cell_bits)
-        if builder == "fast":
-            self._builder = _RunBuilder(count, self._launch)
-        else:
-            self._builder = SurfaceAreaBuilder(session, count, self._cell_bits)
+        builders = {"fast": _RunBuilder, "quality": SurfaceAreaBuilder}
+        self._builder = builders[builder](session, geometry)
         num_nodes, num_leaves = self._builder.num_nodes, self._builder.num_leaves
-        padded = -(-count // _BLOCK) * _BLOCK
         self.structure_bytes = (
-            num_nodes * _NODE_BYTES + num_leaves * _LEAF_BYTES + 8 * padded + self._builder.nbytes
+            num_nodes * _NODE_BYTES + num_leaves * _LEAF_BYTES + self._builder.nbytes
         )
         if memory_limit is not None and self.structure_bytes > memory_limit:
             raise MemoryLimitError(
@@ -77,55 +71,62 @@ class SceneTree:
             )
         self.nodes = session.empty((num_nodes, _NODE_ROWS, _WIDTH), np.float32)
         self.leaves = session.empty((num_leaves, _LEAF_ROWS, _WIDTH), np.float32)
-        self._keys = session.empty(padded, np.uint32)
-        identity = np.arange(padded, dtype=np.uint32)
-        self._identity = session.upload(HIERARCHY_CREATION, identity)
 
     def build(self):
         """Build the tree of the geometry's vertices as they are now, in the same arrays."""
-        triangles, (keys, order) = self.geometry.triangles, self._sorted()
-        self._builder.build(triangles, keys, order, self.nodes, self.leaves)
-
-    def _sorted(self):
-        """The triangles in the order of the curve, and their places along it."""
-        count, triangles = np.uint32(self.geometry.num_triangles), self.geometry.triangles
-        if count == 0:
-            return self._keys, self._identity
-        middles = self.geometry.middles
-        boxes = np.uint32(middles.shape[0])
-        self._launch("place_triangles", count, triangles, boxes, middles, self._keys)
-        with self.session.clock.under(HIERARCHY_CREATION):
-            pairs, bits = (self._keys, self._identity), 3 * self._cell_bits
-            return sort_by_key(self.session, *pairs, bits, digit_bits=self._digit_bits)
-
-
-def _launcher(session, cell_bits):
-    """A function that launches kernels of tree.cl by name, a work-item for each chunk."""
-    chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
-    kernels = session.kernels("tree.cl", CHUNKS=chunks, CELL_BITS=cell_bits)
-    return lambda kernel, *args: session.launch(HIERARCHY_CREATION, kernels[kernel], chunks, *args)
+        self._builder.build(self.nodes, self.leaves)
 
 
 class _RunBuilder:
-    """Runs of eight triangles are leaves, runs of eight leaves nodes, and so on."""
+    """Runs of eight triangles are leaves, runs of eight leaves nodes, and so on.
 
-    nbytes = 0
+    Attributes as those of `SurfaceAreaBuilder`.
+    """
 
-    def __init__(self, num_triangles, launch):
-        self._count, self._launch = num_triangles, launch
-        self.num_leaves = -(-num_triangles // _WIDTH)
+    def __init__(self, session, geometry):
+        self.session, self._geometry = session, geometry
+        count = geometry.num_triangles
+        self.num_leaves = -(-count // _WIDTH)
         self._levels = _levels(self.num_leaves)
         self.num_nodes = sum(self._levels)
+        self._cell_bits, self._digit_bits = _BITS_OF_MANY if count > _MANY_TRIANGLES else _BITS
+        self._chunks = _CHUNKS_PER_UNIT * session.device.max_compute_units
+        self._kernels = session.kernels(
+            "tree.cl", CHUNKS=self._chunks, CELL_BITS=self._cell_bits
+        )
+        self._padded = -(-count // _BLOCK) * _BLOCK
+        self._pairs = None
+        self.nbytes = 2 * np.dtype(np.uint32).itemsize * self._padded
 
-    def build(self, triangles, keys, order, nodes, leaves):
+    def build(self, nodes, leaves):
         """As that of `SurfaceAreaBuilder`."""
+        count, triangles = np.uint32(self._geometry.num_triangles), self._geometry.triangles
         firsts = np.cumsum([0, *self._levels])
-        sizes = map(np.uint32, (self._count, self._levels[-1], firsts[-2]))
-        self._launch("make_leaves", *sizes, order, triangles, leaves, nodes)
+        sizes = map(np.uint32, (self._levels[-1], firsts[-2]))
+        self._launch("make_leaves", count, *sizes, self._sorted(), triangles, leaves, nodes)
         for level in reversed(range(len(self._levels) - 1)):
             above = self._levels[level], firsts[level]
             below = self._levels[level + 1], firsts[level + 1]
             self._launch("make_nodes", *map(np.uint32, above + below), nodes)
+
+    def _sorted(self):
+        """The triangles in the order of the curve."""
+        if self._pairs is None:
+            identity = np.arange(self._padded, dtype=np.uint32)
+            keys = self.session.empty(self._padded, np.uint32)
+            self._pairs = keys, self.session.upload(HIERARCHY_CREATION, identity)
+        if self._padded == 0:
+            return self._pairs[1]
+        geometry, middles = self._geometry, self._geometry.middles
+        count, boxes = map(np.uint32, (geometry.num_triangles, middles.shape[0]))
+        self._launch("place_triangles", count, geometry.triangles, boxes, middles, self._pairs[0])
+        with self.session.clock.under(HIERARCHY_CREATION):
+            options = {"digit_bits": self._digit_bits, "keep_keys": False}
+            return sort_by_key(self.session, *self._pairs, 3 * self._cell_bits, **options)[1]
+
+    def _launch(self, kernel, *args):
+        """Run a kernel, a work-item for each chunk."""
+        self.session.launch(HIERARCHY_CREATION, self._kernels[kernel], self._chunks, *args)
 
 
 def _levels(num_leaves):

@@ -78,7 +78,7 @@ def test_each_triangle_is_in_one_leaf_and_boxes_are_tight(session, rng, builder,
     check(tree_of(session, scene, builder), scene)
 
 
-def test_many_triangles_take_finer_cells(session, rng, builder, monkeypatch):
+def test_many_triangles_take_finer_cells(session, rng, monkeypatch):
     """Of a cluster as wide as 1/512 of the scene keys of 8 bits an axis tell nothing apart."""
     middles = 0.501 + rng.random((3001, 1, 3)) / 512
     middles[:2] = np.float32([[[0, 0, 0]], [[1, 1, 1]]])
@@ -86,9 +86,9 @@ def test_many_triangles_take_finer_cells(session, rng, builder, monkeypatch):
     keys = []
     for most in (3001, 3000):
         monkeypatch.setattr(tree_module, "_MANY_TRIANGLES", most)
-        tree = tree_of(session, scene, builder)
+        tree = tree_of(session, scene, "fast")
         check(tree, scene)
-        keys.append(len(np.unique(tree._sorted()[0].get()[:3001])))
+        keys.append(len(np.unique(tree._builder._pairs[0].get()[:3001])))
     assert keys[0] == 3 and keys[1] > 3
 
 
@@ -112,12 +112,42 @@ def test_degenerate_scenes(session, rng, builder, name):
     check(tree_of(session, scene, builder), scene)
 
 
-def test_depth_is_bounded_where_splits_peel_off_leaf_after_leaf(session, rng):
-    # The far triangle puts all others in one cell of the curve, hence one task: 14 levels, and one
-    # above it (cl/sah.cl). Without the bound there are 17.
-    growing = 1.02 ** np.arange(3000)[:, None, None] * (1 + 1e-3 * rng.random((3000, 3, 3)))
-    scene = scene_of(np.concatenate([growing, np.full((1, 3, 3), 3e37)]))
-    assert check(tree_of(session, scene, "quality"), scene) == 15
+@pytest.fixture
+def with_line(monkeypatch):
+    """A function that replaces a line of cl/subtree.h and gives a session that takes it."""
+    expand = program.expand
+
+    def replace(old, new):
+        def changed(name):
+            assert name != "sah.cl" or expand(name).count(old) == 1
+            return expand(name).replace(old, new)
+
+        monkeypatch.setattr(program, "expand", changed)
+        return device.Session(device.default_device())
+
+    return replace
+
+
+def test_depth_is_bounded(session, with_line, rng):
+    growing = 1.1 ** np.arange(300)[:, None, None] * rng.normal(size=(300, 3, 3))
+    scene = scene_of(growing)
+    assert check(tree_of(session, scene, "quality"), scene) > 5
+    # 4^3 packed leaves hold 320 triangles at least.
+    bounded = with_line("#define TASK_LEVELS 14", "#define TASK_LEVELS 3")
+    assert check(tree_of(bounded, scene, "quality"), scene) <= 3
+
+
+def test_splits_that_need_more_leaves_than_there_are_are_not_made(session, rng):
+    """Eight triangles side by side and three on their own: two leaves, or by surface area three."""
+    near, far = rng.normal(size=(2, 200, 8, 1, 3))
+    far = 5 * far[:, :3] / np.linalg.norm(far[:, :3], axis=-1, keepdims=True)
+    places = np.concatenate([1e-3 * near, np.arange(1, 4)[:, None, None] * far], axis=1)
+    places += 100 * np.arange(200)[:, None, None, None] * (1, 0, 0)
+    corners = places + 1e-3 * rng.normal(size=(200, 11, 3, 3))
+    scene = scene_of(corners.reshape(-1, 3, 3) * (1, 3, 3))
+    tree = tree_of(session, scene, "quality")
+    check(tree, scene)
+    assert len(reachable(tree)[1]) > scene.num_triangles // 4
 
 
 def test_an_empty_scene_has_a_root_without_children(session, builder):
