@@ -12,6 +12,7 @@
 #define FARTHEST 4.0f // neighbours may be so much farther apart than the first two
 #define ROWS_AHEAD 16  // nobody has read them yet
 #define TRIPLES 0x1111u // the first of every four bits
+#define ORIGINS 64u     // that tell of the others
 
 // A caller's arrays. A stride is 1, or 0 where all rays share one value.
 typedef struct {
@@ -131,8 +132,19 @@ inline uint find_rows(const Given *g, uint num_rays)
     return length;
 }
 
+// Whether some rays, spread over all, start where the first does.
+inline bool have_one_origin(const Given *g, uint num_rays)
+{
+    bool one = true;
+    for (uint k = 1; k <= ORIGINS; k++) {
+        global const float *o = g->origins + 3 * ((ulong)(num_rays - 1) * k / ORIGINS);
+        one = one && o[0] == g->origins[0] && o[1] == g->origins[1] && o[2] == g->origins[2];
+    }
+    return one;
+}
+
 // Work-item c < CHUNKS packs a chunk: facts[c] is the first ray that is refused, INVALID where there is none.
-// One more finds rows meanwhile: facts[CHUNKS].
+// One more finds rows meanwhile, facts[CHUNKS], and looks at origins, facts[CHUNKS + 1].
 kernel void pack_rays(const uint num_rays, global const float *restrict origins,
                       global const float *restrict directions, global const float *restrict tnear,
                       const uint tnear_stride, global const float *restrict tfar,
@@ -141,8 +153,12 @@ kernel void pack_rays(const uint num_rays, global const float *restrict origins,
 {
     const Given given = {origins, directions, tnear, tfar, tnear_stride, tfar_stride};
     const uint item = get_global_id(0);
-    facts[item] = item < CHUNKS ? pack_chunk(&given, num_rays, org_tnear, dir_tfar)
-                                : find_rows(&given, num_rays);
+    if (item < CHUNKS) {
+        facts[item] = pack_chunk(&given, num_rays, org_tnear, dir_tfar);
+        return;
+    }
+    facts[CHUNKS] = find_rows(&given, num_rays);
+    facts[CHUNKS + 1] = have_one_origin(&given, num_rays);
 }
 
 // Rays from the camera through every pixel, row by row from the top: direction = forward + sx right

@@ -15,7 +15,7 @@ import pyopencl.array as cla
 from raystream.checks import check_choice
 from raystream.errors import MemoryLimitError
 from raystream.intersect import HitStream, sum_counts
-from raystream.order import leaf_slots, sorted_rays
+from raystream.order import leaf_slots, sorted_rays, tiled_slots
 from raystream.statistics import TRAVERSAL, Statistics
 from raystream.tree import BUILDERS, SceneTree
 
@@ -42,14 +42,15 @@ _ASSUMED_VISITS = 7  # of a ray, where they are not measured
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
 # 1.01 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
 # 1.2). Sorted bundles share a visit among up to some 40 of their 64 rays; sorting takes as long as
-# bundles for 0.1 visits of each ray and 30,000. Streams of scattered rays that make many visits
-# take 0.75 to 0.95 of the time when sorted, that included.
+# bundles for 0.1 visits of each ray and 30,000; bundles of tiles gain less by it, from 0.7 visits
+# on. Streams of scattered rays that make many visits take 0.75 to 0.95 of the time when sorted,
+# that included.
 _FEW_RAYS = 8192
 _SAMPLES = 32
 _CLOSE_PAIRS = 0.75
 _SHARED_BY_BUNDLE, _SHARED_BY_CLOSE_BUNDLE = 6.8, 2.5
 _SHARED_WHEN_SORTED = 40
-_VISITS_OF_A_SORT, _VISITS_OF_ANY_SORT = 0.1, 30_000
+_VISITS_OF_A_SORT, _VISITS_OF_TILES, _VISITS_OF_ANY_SORT = 0.1, 0.7, 30_000
 _SHARED_BY_SCATTERED, _MANY_VISITS, _MANY_VISITS_OF_ANY = 2, 3, 250_000
 _HASHES = {"bundle": "coarse", "stream": "coarsest"}
 
@@ -81,20 +82,22 @@ class _Coherence:
     shared: float
     close: float
 
-    def choice(self, num_rays):
+    def choice(self, num_rays, tiled):
         """The traversal that suits so many rays, and whether they should be sorted for it.
 
         A bundle costs what its nodes and leaves cost, whether one ray enters them or all; a
         stream costs what each ray's nodes and leaves cost, almost whatever their order. So it
         matters how many visits bundles make, and how many rays share one, or would if they were
-        sorted: where neighbours are close, sorting brings together what is close to both.
+        sorted: where neighbours are close, sorting brings together what is close to both; where
+        they are `tiled`, it brings less.
         """
         few = _SHARED_BY_CLOSE_BUNDLE if self.close >= _CLOSE_PAIRS else _SHARED_BY_BUNDLE
         if self.shared < few:
             many = _MANY_VISITS + _MANY_VISITS_OF_ANY / num_rays
             return "stream", self.shared < _SHARED_BY_SCATTERED and self.visits > many
         saved = self.visits * (1 - self.shared / _SHARED_WHEN_SORTED)
-        return "bundle", saved > _VISITS_OF_A_SORT + _VISITS_OF_ANY_SORT / num_rays
+        least = _VISITS_OF_TILES if tiled else _VISITS_OF_A_SORT
+        return "bundle", saved > least + _VISITS_OF_ANY_SORT / num_rays
 
 
 class _Trees:
@@ -208,15 +211,18 @@ class DualTracer:
     def _plan(self, query, rays, result):
         """How to trace these rays, and in which order.
 
-        A few bundles in the given order, spread over all, are traced to see.
+        A few bundles, spread over all, are traced to see: in the order given, or that of tiles
+        where rays start at one point.
         """
         given, traversal = leaf_slots(self.session, rays), self._traversal
         sort, visits = traversal == "bundle", _ASSUMED_VISITS
         if traversal == "auto" and len(rays) < _FEW_RAYS:
             traversal = "single"
         elif traversal == "auto":
+            if rays.one_origin:
+                given = tiled_slots(self.session, rays)
             coherence = self._coherence(query, _Plan("bundle", given), rays, result)
-            traversal, sort = coherence.choice(len(rays))
+            traversal, sort = coherence.choice(len(rays), rays.one_origin)
             visits = coherence.visits
         if sort and rays.size is None:  # tiles of a screen are as good as any order
             given = sorted_rays(self.session, rays, _HASHES[traversal])

@@ -1,4 +1,4 @@
-"""The order of rays in the leaves of a hierarchy: along the screen, or by their hashes."""
+"""The order of rays in the leaves of a hierarchy: in tiles (cl/order.cl), or by their hashes."""
 
 import functools
 
@@ -11,6 +11,7 @@ from raystream.statistics import RAY_CREATION, SORTING
 _INVALID = np.uint32(0xFFFFFFFF)
 _TILE = 8
 _DIGIT_BITS = 10  # two passes over coarse hashes
+_LEAST_CHUNK, _CHUNKS_PER_UNIT = 4096, 16  # eight rows of some 500 rays
 
 
 def screen_slots(width, height):
@@ -115,3 +116,25 @@ def sorted_rays(session, rays, name):
         return sort_by_key(
             session, keys, given, hash.BITS[name], digit_bits=_DIGIT_BITS, keep_keys=False
         )[1]
+
+
+def tiled_slots(session, rays):
+    """Rays from one point to what a picture shows, row by row, in tiles; some pixels may have none.
+
+    Parameters
+    ----------
+    session : raystream.device.Session
+    rays : raystream.rays.Rays
+        At least one.
+
+    Returns
+    -------
+    Array of shape (n,) uint32
+        All rays; in the order given where they are not in rows.
+    """
+    most = _CHUNKS_PER_UNIT * session.device.max_compute_units
+    chunks = max(1, min(most, len(rays) // _LEAST_CHUNK))
+    slots, count = session.empty(len(rays), np.uint32), np.uint32(len(rays))
+    kernel = session.kernels("order.cl")["tile_rows"]
+    session.launch(RAY_CREATION, kernel, chunks, count, rays.dir_tfar, slots)
+    return slots

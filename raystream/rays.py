@@ -26,6 +26,8 @@ class Rays:
         Of shadow rays that all start at one light: its number.
     primary : bool
         Whether these are a camera's rays.
+    one_origin : bool
+        Whether these are not known to be a screen's and start at one point, as far as some tell.
     """
 
     org_tnear: cla.Array
@@ -33,6 +35,7 @@ class Rays:
     size: tuple | None = None
     light: int | None = None
     primary: bool = False
+    one_origin: bool = False
 
     def __len__(self):
         return self.org_tnear.shape[0]
@@ -102,7 +105,7 @@ def _pack(session, count, origins, directions, tnear, tfar):
     if count == 0:
         return packed, 0
     chunks = _chunks(session)
-    facts = session.empty(chunks + 1, np.uint32)
+    facts = session.empty(chunks + 2, np.uint32)
     session.launch(
         RAY_CREATION,
         _kernels(session)["pack_rays"],
@@ -116,8 +119,10 @@ def _pack(session, count, origins, directions, tnear, tfar):
         packed.dir_tfar,
         facts,
     )
-    *refused, width = facts.get().tolist()  # waits: shared arrays may change from here on
+    # Waits: shared arrays may change from here on.
+    *refused, width, one_origin = facts.get().tolist()
     packed.size = (width, count // width) if width else None
+    packed.one_origin = bool(one_origin and not width)
     return packed, min(refused)
 
 

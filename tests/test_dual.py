@@ -326,6 +326,24 @@ def test_auto_sorts_rays_whose_bundles_it_improves(rng, session):
     assert auto.statistics.levels == bundle.statistics.levels
 
 
+def test_auto_takes_rows_of_a_picture_in_tiles(rng, session):
+    """Rays from one point, of which some are missing: the hits of any order, in fewer visits."""
+    scene = triangle_soup(rng, 20_000, size=0.02)
+    x, y = np.meshgrid(*2 * [(np.arange(400) + 0.5) / 200 - 1])
+    directions = np.stack((x, y, np.full_like(x, 2.0)), axis=-1)[np.hypot(x + 1, y) > 0.4]
+    rays = np.broadcast_to([0.5, 0.5, -1.5], directions.shape), directions
+    auto, single = (
+        rs.Tracer(scene, "dual", builder="fast", traversal=t) for t in ("auto", "single")
+    )
+    assert_same_hits(*(tracer.intersect(*rays) for tracer in (auto, single)))
+    in_tiles = auto.statistics.levels[0]["nodes"]
+    stream = from_numpy(session, *rays, 0.0, np.inf)
+    assert stream.one_origin and stream.size is None
+    stream.one_origin = False
+    auto.intersect_stream(session, stream)
+    assert in_tiles < 0.9 * auto.statistics.levels[0]["nodes"]
+
+
 @pytest.mark.parametrize("spread, traversal", [(0.001, "bundle"), (1.0, "stream")])
 def test_auto_takes_bundles_where_neighbours_are_close(spread, traversal, rng):
     """A bundle is eight times eight rays from about one place, in one direction or in any."""

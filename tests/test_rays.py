@@ -137,3 +137,14 @@ def test_other_rays_are_no_screen(session, rng):
     same = np.ones((4096, 3), np.float32)
     assert rays.from_numpy(session, same, same, 0.0, np.inf).size is None
     assert rays.from_numpy(session, *random_rays(rng, 4096), 0.0, np.inf).size is None
+
+
+def test_rays_from_one_point_are_recognised_unless_they_are_a_screens(session, rng):
+    origins, directions = random_rays(rng, 5003)
+    one = np.broadcast_to(origins[0], origins.shape)
+    assert rays.from_numpy(session, one, directions, 0.0, 1.0).one_origin
+    assert not rays.from_numpy(session, origins, directions, 0.0, 1.0).one_origin
+    two = np.where(np.arange(5003)[:, None] < 4900, one, origins[1])
+    assert not rays.from_numpy(session, two, directions, 0.0, 1.0).one_origin
+    screen = rays.from_numpy(session, *pixels(64, 64, unit=True), 0.0, np.inf)
+    assert screen.size == (64, 64) and not screen.one_origin
