@@ -47,7 +47,7 @@ inline float8 thing_of(global const float4 *triangles, uint number)
 }
 
 // Sixteen cells between bounds of the middles along each axis; what rounding moves out of them is in the
-// first and the last. Where the bounds are one, or farther apart than floats go, all are in the first.
+// first and the last. Where the bounds are one, or nearly so, or farther apart than floats go, all are in one.
 typedef struct {
     float4 low, scale;
 } Binning;

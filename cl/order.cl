@@ -64,7 +64,7 @@ inline uint next_row(global const float4 *dir_tfar, uint row, uint end, uint *le
         if (d < least)
             least = d, *length = k;
     }
-    *near = least <= NEAR * gaps(dir_tfar, row, SHORTEST);
+    *near = least < INFINITY && least <= NEAR * gaps(dir_tfar, row, SHORTEST);
     return row + *length;
 }
 

@@ -6,7 +6,9 @@
 // Ranges of things are split in two, level by level, each of them by PIECES work-items (start_build, then
 // choose_planes and split_ranges once a level), until they are small enough or LEVELS splits deep. The nodes
 // above are made first (plan_tasks), then the subtrees of the others side by side (build_tasks): each is
-// a task, or all the ends below a node together. A split moves things from one array to the other.
+// a task, or all the ends below a node together. A split of many things moves them from one array to the other.
+// When
+// triangles have moved a little the same tasks are refitted (refit_tasks); finish_tree says how good the tree is.
 //
 // A range becomes a node by up to seven splits in two, each of the largest part. Sixteen bins along each axis
 // choose the place in the top levels, along one axis in tasks: the best for a sample of many things, the
@@ -17,16 +19,18 @@
 // - Leaves: things in a row fill leaves with at least five triangles each but the last (`packed`), so over
 //   w triangles NEED(w) leaves are enough. A task has some more. A split whose parts need more than is left
 //   is not made; from there on parts end where leaves do that things fill in their order.
-// - Nodes: one with A of its kind whose children all are leaves has at least two of them each, the
-//   others have eight children each: over L leaves there are at most (L + 6 A) / 7 <= 4 L / 7.
-// - Depth: a node `budget` levels above the lowest holds at most 4^budget packed leaves. Where it could
-//   hold no more, parts are halves by packed leaves, the heaviest first. Leaves of five to eight triangles make
-//   the larger half at most 8/13 of the whole, so seven splits leave no part above a quarter.
+// - Nodes: A of a task's have leaves alone for children, at least two of them each but for the root over up to
+//   eight triangles, the others have eight children: over L leaves there are at most (L + 6 A) / 7 <= 4 L / 7.
+// - Depth: a node `budget` levels above the lowest holds at most 4^budget packed leaves, hence less than
+//   4 T triangles, T being 5 * 4^(budget - 1). Where it could hold no more, parts are halves by packed leaves,
+//   the heaviest first. Three halvings leave a part with less than T. Parts of T or more are at most one, two
+//   and three after no, one and two halvings: six splits, of seven that are made, leave none.
 //
 // Deterministic: which work-item takes a task decides nothing.
 //
 // Build-time constants: PIECES, LEVELS.
 
+#include "refit.h"
 #include "subtree.h"
 
 #define MOST 4 // triangles to a thing
@@ -203,12 +207,17 @@ kernel void split_ranges(const uint level, global const Top *restrict tops,
 
 // Ends whose parts, `count` of them, are built below one node; INVALID where all are one leaf. `range` holds
 // them, and no others.
+// What it has made are leaves and nodes in a row, beside `node`, and `area` is that of the nodes' children.
 typedef struct {
     uint range, node, count, ends[TREE_WIDTH];
+    uint leaf, leaf_end, first, first_end;
+    float area;
 } Task;
 
+// `next`: that no one has taken. Nodes above the tasks have numbers below `top`; the area of their children.
 typedef struct {
-    uint count, next; // the next that no one has taken
+    uint count, next, top;
+    float area;
     Task tasks[1 << LEVELS];
 } Tasks;
 
@@ -237,6 +246,7 @@ kernel void plan_tasks(global const Top *restrict tops, global Tasks *restrict a
 {
     uint2 stack[(TREE_WIDTH - 1) * LEVELS + 1]; // a range and its node
     uint top = 0, next_node = 1;
+    float area = 0.0f;
     all->count = all->next = 0;
     stack[top++] = (uint2)(1, 0);
     while (top > 0) {
@@ -272,9 +282,12 @@ kernel void plan_tasks(global const Top *restrict tops, global Tasks *restrict a
                 add_task(all, h, is_leaf ? INVALID : child, &h, 1);
             }
             set_child(&c, k, tops[h].box, child);
+            area += half_area(tops[h].box);
         }
         store_node(nodes, w.y, &c);
     }
+    all->top = next_node;
+    all->area = area;
 }
 
 // The things of range 1 side by side, which have gaps between pieces; returns the place behind the last.
@@ -293,9 +306,9 @@ kernel void build_tasks(global const Top *restrict tops, global const uint2 *res
                         global float8 *restrict nodes, global float8 *restrict leaves)
 {
     for (uint k = atomic_inc(&all->next); k < all->count; k = atomic_inc(&all->next)) {
-        const Task task = all->tasks[k];
+        Task task = all->tasks[k];
         const uint h = task.range, level = 31 - clz(h), leaf = first_leaf(tops, h);
-        Subtree t = {{even, odd}, nodes, leaves, triangles, first_node(leaf) + 1, leaf};
+        Subtree t = {{even, odd}, nodes, leaves, triangles, first_node(leaf) + 1, leaf, 0, 0.0f};
         const uint heirs = 1 << (LEVELS - level);
         t.spare = (tops[h].before + tops[h].weight) / 4 - tops[h].before / 4 + heirs;
         Range parts[TREE_WIDTH];
@@ -314,5 +327,60 @@ kernel void build_tasks(global const Top *restrict tops, global const uint2 *res
             make_leaf(&t, parts);
         else
             build_subtree(&t, parts, task.count, task.node);
+        task.leaf = leaf;
+        task.leaf_end = t.next_leaf;
+        task.first = first_node(leaf) + 1;
+        task.first_end = t.next_node;
+        task.area = t.area;
+        all->tasks[k] = task;
+    }
+}
+
+// Whether a node of the top is none that a task makes.
+inline bool is_above(global const Tasks *all, uint node)
+{
+    for (uint k = 0; k < all->count; k++)
+        if (all->tasks[k].node == node)
+            return false;
+    return true;
+}
+
+// One work-item, after build_tasks or refit_tasks: the nodes above the tasks, where they are to be refitted. Of
+// half the areas the sum over all nodes' children to areas[0], the root's to areas[1]: a line through the
+// root is expected to meet as many nodes and leaves as one goes into the other.
+kernel void finish_tree(const uint refit, global Tasks *restrict all, global float8 *restrict nodes,
+                        global const float8 *restrict leaves, global float *restrict areas)
+{
+    float area = refit ? 0.0f : all->area;
+    for (uint k = 0; k < all->count; k++)
+        area += all->tasks[k].area;
+    for (uint node = all->top; refit && node-- > 0;)
+        if (is_above(all, node))
+            area += refit_node(nodes, leaves, node);
+    float size[3];
+    for (uint axis = 0; axis < 3; axis++)
+        size[axis] = highest8(nodes[3 + axis]) - lowest8(nodes[axis]);
+    areas[0] = area;
+    areas[1] = size[0] * size[1] + size[1] * size[2] + size[2] * size[0];
+    all->next = 0;
+}
+
+// A task's leaves and nodes around triangles that have moved.
+kernel void refit_tasks(global Tasks *restrict all, global const float4 *restrict triangles,
+                        global float8 *restrict nodes, global float8 *restrict leaves)
+{
+    for (uint k = atomic_inc(&all->next); k < all->count; k = atomic_inc(&all->next)) {
+        const Task task = all->tasks[k];
+        for (uint leaf = task.leaf; leaf < task.leaf_end; leaf++) {
+            prefetch_triangles(leaves + LEAF_ROWS * (ulong)MIN(leaf + REFIT_AHEAD, task.leaf_end - 1),
+                               triangles);
+            refit_leaf(leaves + LEAF_ROWS * (ulong)leaf, triangles);
+        }
+        float area = 0.0f;
+        for (uint node = task.first_end; node-- > task.first;)
+            area += refit_node(nodes, leaves, node);
+        if (task.node != INVALID)
+            area += refit_node(nodes, leaves, task.node);
+        all->tasks[k].area = area;
     }
 }

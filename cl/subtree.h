@@ -24,6 +24,7 @@ typedef struct {
     global float8 *things[2], *nodes, *leaves;
     global const float4 *triangles;
     uint next_node, next_leaf, spare;
+    float area; // of its nodes' children
 } Subtree;
 
 inline void measure(const Subtree *t, Range *r)
@@ -183,12 +184,14 @@ inline Range halve(const Subtree *t, Range *r)
 // The same, where the surface area heuristic says, or where it says nothing or would need too many leaves.
 inline Range split(Subtree *t, Range *r, bool halves)
 {
-    const uint count = r->end - r->begin;
     if (halves || r->packed)
         return halve(t, r);
-    const Line line = line_of(r->middles, choose_axis(t, r));
+    const bool many = r->end - r->begin > FEW;
+    Line line = {0, 0.0f, 0.0f};
     Parts parts;
-    const Cut cut = count <= FEW ? cut_few(t, r) : cut_many(t, r, line, &parts);
+    if (many)
+        line = line_of(r->middles, choose_axis(t, r));
+    const Cut cut = many ? cut_many(t, r, line, &parts) : cut_few(t, r);
     if (!(cut.cost < INFINITY))
         return halve(t, r);
     const uint weight = TRIANGLES(cut.before), rest = r->weight - weight;
@@ -198,7 +201,7 @@ inline Range split(Subtree *t, Range *r, bool halves)
     t->spare += NEED(r->weight) - needed;
     Range front = *r, back = *r;
     front.end = back.begin = r->begin + THINGS(cut.before);
-    if (count > FEW) {
+    if (many) {
         partition(t, r, line, cut.last);
         front.swapped = back.swapped = r->swapped ^ 1;
         front.box = parts.boxes[0], back.box = parts.boxes[1];
@@ -227,33 +230,16 @@ inline bool needs_all(uint leaves, uint budget)
 inline uint make_leaf(Subtree *t, const Range *r)
 {
     global const float8 *things = t->things[r->swapped];
-    global float8 *leaf = t->leaves + LEAF_ROWS * (ulong)t->next_leaf;
-    float4 s[2][16] __attribute__((aligned(64)));
     uint numbers[TREE_WIDTH] __attribute__((aligned(32)));
     uint lane = 0;
     for (uint i = r->begin; i < r->end; i++) {
         const uint first = as_uint(things[i].FIRST), weight = weight_of(things[i]);
-        for (uint k = 0; k < weight; k++, lane++) {
-            global const float4 *v = t->triangles + TRIANGLE_FLOAT4S * (ulong)(first + k);
-            numbers[lane] = first + k;
-            s[0][lane] = v[0];
-            s[0][lane + 8] = v[1];
-            s[1][lane] = s[1][lane + 8] = v[2];
-        }
+        for (uint k = 0; k < weight; k++)
+            numbers[lane++] = first + k;
     }
-    for (; lane < TREE_WIDTH; lane++) {
-        numbers[lane] = NO_CHILD;
-        s[0][lane] = s[0][lane + 8] = s[1][lane] = s[1][lane + 8] = NAN;
-    }
-    float16 rows[2][3], unused;
-    TRANSPOSE16(s[0], rows[0][0], rows[0][1], rows[0][2], unused);
-    TRANSPOSE16(s[1], rows[1][0], rows[1][1], rows[1][2], unused);
-    for (uint axis = 0; axis < 3; axis++) {
-        leaf[axis] = rows[0][axis].lo;
-        leaf[3 + axis] = rows[0][axis].hi;
-        leaf[6 + axis] = rows[1][axis].lo;
-    }
-    leaf[LEAF_TRIANGLE_ROW] = as_float8(*(const uint8 *)numbers);
+    while (lane < TREE_WIDTH)
+        numbers[lane++] = NO_CHILD;
+    fill_leaf(t->leaves + LEAF_ROWS * (ulong)t->next_leaf, numbers, t->triangles);
     return LEAF | t->next_leaf++;
 }
 
@@ -310,6 +296,7 @@ inline void build_subtree(Subtree *t, Range *parts, uint count, uint node)
             set_empty(&c, k);
             if (k >= count || parts[k].weight == 0)
                 continue; // the range of a scene without triangles is empty
+            t->area += half_area(parts[k].box);
             if (parts[k].weight <= TREE_WIDTH) {
                 set_child(&c, k, parts[k].box, make_leaf(t, &parts[k]));
                 continue;

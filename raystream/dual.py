@@ -37,7 +37,10 @@ _COUNTS = (
 # in the given order make in the fast one's tree, where they make 1.6 times as many.
 _VISITS_WORTH_QUALITY = 14.5  # of a triangle
 _MORE_VISITS_IN_FAST = 2
-_ASSUMED_VISITS = 7  # of a ray, where they are not measured
+_ASSUMED_VISITS = 7  # of a ray
+_VISITS_OF_NO_REFIT = 2  # of a triangle: some 8 ns, by which the fast builder takes longer
+_MOST_WORSE = 1.15  # a refitted tree, before another is built
+_HIGHEST_PRICE = 64
 # See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
 # 1.01 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
@@ -57,11 +60,11 @@ _HASHES = {"bundle": "coarse", "stream": "coarsest"}
 
 @dataclasses.dataclass
 class _Plan:
-    """A traversal, the order of the rays for it, and the visits of each as a bundle's."""
+    """A traversal, the order of the rays for it, and the measured visits of each as a bundle's."""
 
     traversal: str
     slots: cla.Array
-    visits: float = _ASSUMED_VISITS
+    visits: float | None = None
 
 
 @dataclasses.dataclass
@@ -108,7 +111,13 @@ class _Trees:
         self._session, self._memory_limit, self._builder = session, memory_limit, builder
         self._trees, self._built, self._version = {}, None, None
         self._visits, self._visits_before = 0, 0  # in this version, in the last
-        self._quality_fits = True
+        self._affordable = True  # the better one, within the limit
+        self._fits = False  # the better one, to the latest vertices as far as has been tried
+        self._worse = None  # so many times it meets lines, where it has been refitted to them
+        # Visits of the other one since the better one was built, and times as many as would be
+        # worth it in one version: twice as many each time that it has not fitted the next. So many
+        # versions it is not tried again.
+        self._visits_unpaid, self._price, self._wait = 0, 1, 0
 
     def current(self):
         """The `SceneTree` of the geometry as it is now."""
@@ -118,28 +127,71 @@ class _Trees:
             self._add(builder)
         if builder != self._built:
             self._trees[builder].build()
-            self._built = builder
+            self._built, self._worse = builder, None
+            if builder == "quality":
+                self._visits_unpaid, self._fits = 0, True
         return self._trees[builder]
 
-    def expect(self, visits):
-        """Rays are about to be traced with so many visits: they may be worth another hierarchy."""
+    def expect(self, num_rays, visits=None):
+        """Rays are about to be traced: they may be worth another hierarchy.
+
+        Parameters
+        ----------
+        num_rays : int
+        visits : float, optional
+            Of each ray in the hierarchy as it is now; where they are not measured some are assumed.
+        """
         self._notice_change()
-        self._visits += visits * (_MORE_VISITS_IN_FAST if self._built == "quality" else 1)
+        if visits is None:
+            visits = _ASSUMED_VISITS
+        elif self._built == "quality":
+            visits *= _MORE_VISITS_IN_FAST
+        visits *= num_rays
+        self._visits += visits
+        self._visits_unpaid += 0 if self._built == "quality" else visits
 
     def _notice_change(self):
-        if self._version != self.geometry.version:
-            self._built, self._version = None, self.geometry.version
-            self._visits, self._visits_before = 0, self._visits
+        if self._version == self.geometry.version:
+            return
+        if self._built == "fast":
+            self._visits_unpaid += _VISITS_OF_NO_REFIT * self.geometry.num_triangles
+        self._built, self._worse, self._version = None, None, self.geometry.version
+        self._visits, self._visits_before = 0, self._visits
+        self._wait = max(0, self._wait - 1)
+        if self._builder == "auto" and self._fits:
+            self._refit()
+
+    def _refit(self):
+        """Fit the better tree to the new vertices, unless that has failed of late."""
+        if self._wait > 0:
+            self._fits = False
+            return
+        self._worse = self._trees["quality"].refit()
+        self._fits = self._worse <= _MOST_WORSE
+        if self._fits:
+            self._built, self._price = "quality", 1
+        else:
+            self._price = self._wait = min(2 * self._price, _HIGHEST_PRICE)
 
     def _chosen(self):
         worth = _VISITS_WORTH_QUALITY * self.geometry.num_triangles
-        if max(self._visits, self._visits_before) < worth or not self._quality_fits:
+        if self._built == "quality" and self._worse and self._visits * (self._worse - 1) > worth:
+            self._built = None
+        if self._built == "quality":
+            return "quality"
+        # It may be worth it in this version alone, or for the next, if it can be refitted to them.
+        paid = max(self._visits, self._visits_before)
+        if self._wait == 0:
+            paid = max(paid, self._visits_unpaid / self._price)
+        if paid < worth or not self._affordable:
             return "fast"
+        if "fast" not in self._trees:
+            self._add("fast")  # or the better one might leave no room for it
         if "quality" not in self._trees:
             try:
                 self._add("quality")
             except MemoryLimitError:
-                self._quality_fits = False
+                self._affordable = False
                 return "fast"
         return "quality"
 
@@ -161,7 +213,9 @@ class DualTracer:
     builder : {"auto", "fast", "quality"}
         See `raystream.tree.SceneTree`. "auto" takes "quality" where the rays traced since the
         geometry changed, or those between the two changes before, save what it costs, as far as
-        their visits tell, and `memory_limit` allows a second hierarchy; else "fast".
+        their visits tell, and `memory_limit` allows a second hierarchy; else "fast". A tree of
+        "quality" is fitted to the next vertices for as long as that leaves it nearly as good, and
+        so is built, too, where the rays of several changes are worth it.
     traversal : {"auto", "single", "bundle", "stream"}
         How rays walk the hierarchy. "auto" measures which is the fastest for the rays of each call.
 
@@ -203,7 +257,7 @@ class DualTracer:
 
     def _trace(self, query, rays, result):
         plan = self._plan(query, rays, result)
-        self._trees.expect(plan.visits * len(rays))
+        self._trees.expect(len(rays), plan.visits)
         sums = self._run(query, plan, rays, result)
         facts = self._trees.geometry.num_triangles, self.tree().structure_bytes
         return functools.partial(_statistics, self.session.queue, sums, *facts)
@@ -214,19 +268,20 @@ class DualTracer:
         A few bundles, spread over all, are traced to see: in the order given, or that of tiles
         where rays start at one point.
         """
-        given, traversal = leaf_slots(self.session, rays), self._traversal
-        sort, visits = traversal == "bundle", _ASSUMED_VISITS
+        traversal, slots, visits = self._traversal, None, None
+        sort = traversal == "bundle"
         if traversal == "auto" and len(rays) < _FEW_RAYS:
             traversal = "single"
         elif traversal == "auto":
-            if rays.one_origin:
-                given = tiled_slots(self.session, rays)
-            coherence = self._coherence(query, _Plan("bundle", given), rays, result)
+            slots = (tiled_slots if rays.one_origin else leaf_slots)(self.session, rays)
+            coherence = self._coherence(query, _Plan("bundle", slots), rays, result)
             traversal, sort = coherence.choice(len(rays), rays.one_origin)
             visits = coherence.visits
         if sort and rays.size is None:  # tiles of a screen are as good as any order
-            given = sorted_rays(self.session, rays, _HASHES[traversal])
-        return _Plan(traversal, given, visits)
+            slots = sorted_rays(self.session, rays, _HASHES[traversal])
+        elif slots is None:
+            slots = leaf_slots(self.session, rays)
+        return _Plan(traversal, slots, visits)
 
     def _coherence(self, query, plan, rays, result):
         sums = self._run(query, plan, rays, result, most=_SAMPLES)

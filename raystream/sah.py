@@ -4,13 +4,12 @@ import numpy as np
 
 from raystream.statistics import HIERARCHY_CREATION
 
-_WIDTH = 8  # children of a node, triangles of a leaf: cl/tree.h
 _LEAST_FILL = 4  # triangles to a leaf, on average: splits by surface area leave some 7
 # Tasks should be enough to share out evenly; smaller ones cost launches.
 _TASKS_PER_UNIT, _LEAST_TASK, _MOST_LEVELS = 8, 512, 8
 _PIECES_PER_UNIT, _MOST_PIECES = 8, 64
 _WORKERS_PER_UNIT = 4
-_TOP_BYTES, _BINS_BYTES, _TASK_WORDS = 96, 3 * 16 * 40, 11  # cl/sah.cl
+_TOP_BYTES, _BINS_BYTES, _TASK_WORDS = 96, 3 * 16 * 40, 16  # cl/sah.cl
 
 
 class SurfaceAreaBuilder:
@@ -47,18 +46,20 @@ class SurfaceAreaBuilder:
             "tops": ((tops, _TOP_BYTES), np.uint8),
             "pieces": ((tops, self._pieces, 2), np.uint32),
             "bins": ((max(1, tops // 4) * self._pieces, _BINS_BYTES), np.uint8),
-            "tasks": (2 + tops // 2 * _TASK_WORDS, np.uint32),
+            "tasks": (4 + tops // 2 * _TASK_WORDS, np.uint32),
+            "areas": (2, np.float32),
         }
         self.nbytes = sum(
             int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in self._shapes.values()
         )
-        self._arrays = None
         self._kernels = session.kernels("sah.cl", PIECES=self._pieces, LEVELS=self._levels)
+
+    def allocate(self):
+        """The arrays that it works in."""
+        self._arrays = {k: self.session.empty(*of) for k, of in self._shapes.items()}
 
     def build(self, nodes, leaves):
         """Fill arrays of `num_nodes` and `num_leaves`, as those of `SceneTree`."""
-        if self._arrays is None:
-            self._arrays = {k: self.session.empty(*of) for k, of in self._shapes.items()}
         a, geometry, target = self._arrays, self._geometry, np.uint32(self._target)
         triangles, boxes = geometry.triangles, geometry.middles
         splits, things = (a["tops"], a["pieces"]), (a["even"], a["odd"])
@@ -76,6 +77,33 @@ class SurfaceAreaBuilder:
         self._launch(
             "build_tasks", self._workers, *splits, a["tasks"], triangles, *things, nodes, leaves
         )
+
+        self._areas = self._finish(False, nodes, leaves)
+
+    def refit(self, nodes, leaves):
+        """Fit the tree that was built last to where the triangles are now.
+
+        Returns
+        -------
+        float
+            Times as many nodes and leaves as when it was built a line meets, through where the
+            scene was or is, whichever is smaller: what flies off must not hide the rest.
+        """
+        a = self._arrays
+        arrays = a["tasks"], self._geometry.triangles, nodes, leaves
+        self._launch("refit_tasks", self._workers, *arrays)
+        areas = self._finish(True, nodes, leaves)
+        self.session.queue.finish()
+        area, root = areas.astype(float)
+        area_before, root_before = self._areas.astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return area / min(root, root_before) * root_before / area_before
+
+    def _finish(self, refit, nodes, leaves):
+        """Areas of all boxes and of the root's, there when the queue is done."""
+        a = self._arrays
+        self._launch("finish_tree", 1, np.uint32(refit), a["tasks"], nodes, leaves, a["areas"])
+        return self.session.fetch(HIERARCHY_CREATION, a["areas"])
 
     def _launch(self, kernel, size, *args):
         self.session.launch(HIERARCHY_CREATION, self._kernels[kernel], size, *args)

@@ -69,12 +69,23 @@ class SceneTree:
                 f"scene hierarchy: {count} triangles need {self.structure_bytes} bytes "
                 f"of memory_limit {memory_limit}"
             )
+        self._builder.allocate()
         self.nodes = session.empty((num_nodes, _NODE_ROWS, _WIDTH), np.float32)
         self.leaves = session.empty((num_leaves, _LEAF_ROWS, _WIDTH), np.float32)
 
     def build(self):
         """Build the tree of the geometry's vertices as they are now, in the same arrays."""
         self._builder.build(self.nodes, self.leaves)
+
+    def refit(self):
+        """Fit a tree of builder "quality", built before, to the vertices as they are now.
+
+        Returns
+        -------
+        float
+            Times as many nodes and leaves as when it was built a line through the scene meets.
+        """
+        return self._builder.refit(self.nodes, self.leaves)
 
 
 class _RunBuilder:
@@ -95,8 +106,13 @@ class _RunBuilder:
             "tree.cl", CHUNKS=self._chunks, CELL_BITS=self._cell_bits
         )
         self._padded = -(-count // _BLOCK) * _BLOCK
-        self._pairs = None
         self.nbytes = 2 * np.dtype(np.uint32).itemsize * self._padded
+
+    def allocate(self):
+        """As that of `SurfaceAreaBuilder`."""
+        identity = np.arange(self._padded, dtype=np.uint32)
+        keys = self.session.empty(self._padded, np.uint32)
+        self._pairs = keys, self.session.upload(HIERARCHY_CREATION, identity)
 
     def build(self, nodes, leaves):
         """As that of `SurfaceAreaBuilder`."""
@@ -111,10 +127,6 @@ class _RunBuilder:
 
     def _sorted(self):
         """The triangles in the order of the curve."""
-        if self._pairs is None:
-            identity = np.arange(self._padded, dtype=np.uint32)
-            keys = self.session.empty(self._padded, np.uint32)
-            self._pairs = keys, self.session.upload(HIERARCHY_CREATION, identity)
         if self._padded == 0:
             return self._pairs[1]
         geometry, middles = self._geometry, self._geometry.middles

@@ -22,6 +22,7 @@ import raystream as rs
 from raystream import device, program
 from raystream.errors import MemoryLimitError
 from raystream.rays import from_camera, from_numpy
+from raystream.sah import SurfaceAreaBuilder
 from raystream.statistics import HIERARCHY_CREATION, TRAVERSAL
 
 TRAVERSALS = ("single", "bundle", "stream", "auto")
@@ -217,14 +218,16 @@ def test_moving_vertices(rng, traversal):
         assert_same_hits(dual.intersect(*rays), brute.intersect(*rays))
 
 
-def test_the_better_builder_is_left_where_it_does_not_fit(rng, session):
-    scene, rays = triangle_soup(rng, 1000), random_rays(rng, 10000)
+@pytest.mark.parametrize("count", [8000, 10_000])  # alone, and after a look at some
+def test_the_better_builder_is_left_where_it_does_not_fit(rng, count):
+    scene, rays = triangle_soup(rng, 1000), random_rays(rng, count)
     bytes_of = {}
     for builder in ("fast", "quality"):
         tracer = rs.Tracer(scene, "dual", builder=builder)
         tracer.intersect(*rays)
         bytes_of[builder] = tracer.statistics.structure_bytes
-    for limit, built in ((sum(bytes_of.values()), "quality"), (bytes_of["quality"] - 1, "fast")):
+    both = sum(bytes_of.values())
+    for limit, built in ((both, "quality"), (both - 1, "fast"), (bytes_of["fast"], "fast")):
         tracer = rs.Tracer(scene, "dual", memory_limit=limit)
         for _ in range(2):
             tracer.intersect(*rays)
@@ -383,9 +386,48 @@ def test_the_better_builder_is_taken_for_many_rays(rng):
 
     for expected in (fast, quality, quality):  # 1.6 rays to a triangle each, 2.1 are worth it
         trace(expected)
-    for expected in (quality, fast):  # 4.8 and 1.6 rays to a triangle in the frame before
+    for expected in (quality, quality):  # 4.8 rays to a triangle in the frame before; fitted
         auto.update_vertices(scene.vertices)
         trace(expected)
+    auto.update_vertices(scene.vertices)
+    auto.intersect(*(array[:500] for array in rays))
+    elsewhere = triangle_soup(rng, 1000).vertices
+    for tracer in (auto, fast):
+        tracer.update_vertices(elsewhere)
+    trace(fast)  # it does not fit, and half a ray to a triangle is not worth another
+
+
+def test_the_better_tree_is_built_for_the_frames_to_come_and_refitted(rng):
+    """2.1 rays to a triangle are worth it, those of two frames here."""
+    scene, rays = triangle_soup(rng, 1000), random_rays(rng, 1600)
+    auto, fast, quality = (rs.Tracer(scene, "dual", builder=b) for b in ("auto", "fast", "quality"))
+    for frame, expected in enumerate((fast, quality, quality, quality)):
+        moved = scene.vertices + np.float32(1e-3) * rng.random(scene.vertices.shape)
+        for tracer in (auto, expected):
+            tracer.update_vertices(moved.astype(np.float32))
+        assert_same_hits(auto.intersect(*rays), expected.intersect(*rays))
+        visits, fitting = (
+            sum(level["nodes"] for level in tracer.statistics.levels) for tracer in (auto, expected)
+        )
+        assert visits == fitting if frame < 2 else 0.95 < visits / fitting < 1.05
+
+
+def test_trees_that_do_not_fit_the_next_frame_are_built_ever_more_seldom(rng, monkeypatch):
+    """1.6 rays to a triangle, and triangles that are elsewhere in every frame."""
+    scene, rays = triangle_soup(rng, 1000), random_rays(rng, 1600)
+    builds, build = [0], SurfaceAreaBuilder.build
+
+    def counted(self, *arrays):
+        builds[-1] += 1
+        build(self, *arrays)
+
+    monkeypatch.setattr(SurfaceAreaBuilder, "build", counted)
+    tracer = rs.Tracer(scene, "dual")
+    for _ in range(64):
+        tracer.update_vertices(triangle_soup(rng, 1000).vertices)
+        tracer.intersect(*rays)
+        builds.append(builds[-1])
+    assert np.flatnonzero(np.diff(builds[:-1])).tolist() == [0, 3, 8, 17, 35]
 
 
 def test_incoherent_rays_are_worth_the_better_builder_sooner(rng, session):

@@ -199,6 +199,52 @@ def test_new_vertices_give_the_tree_of_a_new_scene(session, rng, builder):
     assert_same_tree(tree, tree_of(session, moved, builder))
 
 
+def moved(rng, scene, share):
+    """The scene with every vertex moved by up to a share of its size."""
+    vertices = scene.vertices + share * np.ptp(scene.vertices) * rng.random(scene.vertices.shape)
+    return rs.Scene([rs.Mesh(vertices.astype(np.float32), scene.faces, name="moved")])
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_a_refitted_tree_holds_the_triangles_where_they_are(session, rng, count):
+    scene = triangle_soup(rng, count, size=0.1)
+    tree = tree_of(session, scene, "quality")
+    for share in (0.0, 1e-3, 1.0):
+        after = moved(rng, scene, share)
+        tree.geometry.update(after.vertices)
+        worse = tree.refit()
+        check(tree, after)
+        if count > 100:
+            assert worse == pytest.approx(1, rel=0.03) if share < 1 else worse > 1.5
+
+
+def test_a_vertex_that_flies_off_does_not_hide_that_a_tree_fits_no_more(session, rng):
+    scene = triangle_soup(rng, 5003, size=0.1)
+    tree = tree_of(session, scene, "quality")
+    vertices = rng.permutation(scene.vertices.reshape(-1, 3, 3)).reshape(-1, 3)
+    vertices[0] = 1000
+    tree.geometry.update(vertices)
+    assert tree.refit() > 1.5
+
+
+def test_a_refit_where_nothing_has_moved_changes_nothing(session, rng):
+    tree = tree_of(session, triangle_soup(rng, 20011, size=0.1), "quality")
+    before = reachable(tree)
+    assert tree.refit() == pytest.approx(1, rel=1e-4)
+    for a, b in zip(before, reachable(tree), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_scenes_are_refitted(session, rng, name):
+    scene = scene_of(DEGENERATE[name](rng))
+    tree = tree_of(session, scene, "quality")
+    shuffled = scene_of(rng.permutation(scene.vertices[scene.faces]))
+    tree.geometry.update(shuffled.vertices)
+    tree.refit()
+    check(tree, shuffled)
+
+
 def test_the_portable_path_gives_the_same_tree(session, rng, builder, monkeypatch):
     scene = triangle_soup(rng, 5003, size=0.1)
     expected = tree_of(session, scene, builder)

@@ -1,18 +1,21 @@
 """`dual` against Open3D, Mitsuba and embreex; run as
 
     RAYSTREAM_SCENES=... python tests/bench/bench_dual.py [--threads 1,2] [--rays 262144,1048576]
-                                                        [--scenes ...] [--kinds ...]
+                                          [--scenes ...] [--kinds ...]
+                                          [--builder auto] [--amplitude 0.01]
 
 Two questions, each asked of all in turn in every round, medians of the rounds:
 
-frame   new vertices in numpy to hits in numpy: upload, build, trace, download
+frame   new vertices in numpy to hits in numpy: upload, build, trace, download; the vertices are
+        those of a wave of 1 % of the scene's size that travels through it, eight frames long
 trace   tracing alone: rays in each one's own arrays to hits in its own, the scene stands; our
         sorting of rays and choice of a traversal count
 
-Hits are compared before times are printed: ours with Embree's by baselines/tolerance.py, those of
-the others by the share of rays that agree. Times are milliseconds; a ratio is the time of the best
-of Open3D and Mitsuba over ours. embreex traces on one thread, one ray at a time, whatever is asked
-for.
+Hits are compared before times are printed: ours with Embree's by baselines/tolerance.py, where the
+scene stands and after the wave's frames, those of the others by the share of rays that agree. Times
+are milliseconds; a ratio is the time of the best of Open3D and Mitsuba over ours. embreex traces on
+one thread, one ray at a time, whatever is asked for. With a builder named, or a wave of half the
+scene's size (--amplitude 0.5), no tree of ours fits the next frame: each frame has a new one.
 """
 
 import argparse
@@ -45,6 +48,7 @@ _PAUSE = 0.2  # seconds until the threads of the one before have stopped looking
 _WARM = 0.06  # seconds until a processor that has paused is as fast as it gets
 _BUMPINESS = 0.35  # of a normal of length 1
 _OFF_SURFACE = 1e-4  # of the scene's size: where secondary rays start
+_POSES, _WAVES = 8, 2  # of a wave that travels through the scene
 
 
 # ---- scenes and rays ----
@@ -120,14 +124,24 @@ def _float32(origins, directions, tfar=np.inf):
     return origins.astype(np.float32), directions.astype(np.float32), tfar
 
 
+def poses(vertices, amplitude=0.01):
+    """The vertices in each frame of a wave: each coordinate swings along the next one."""
+    low, size = vertices.min(axis=0), np.ptp(vertices, axis=0).max()
+    along = np.roll((vertices - low) / size, -1, axis=1) * _WAVES
+    phases = 2 * np.pi * (along + np.arange(_POSES)[:, None, None] / _POSES)
+    return (vertices + amplitude * size * np.sin(phases)).astype(np.float32)
+
+
 # ---- those who run ----
 
 
 class Dual:
-    """This library, every choice automatic."""
+    """This library, every choice automatic, but for the builder where one is named."""
+
+    builder = "auto"
 
     def __init__(self, scene, threads):
-        self.tracer = rs.Tracer(scene, "dual")
+        self.tracer = rs.Tracer(scene, "dual", builder=self.builder)
         self._queue = device.session().queue
 
     def update(self, vertices):
@@ -313,13 +327,13 @@ def flat(scene):
     return rs.Scene([rs.Mesh(scene.vertices, scene.faces, name="all")])
 
 
-def measure(name, folder, kinds, counts, threads):
+def measure(name, folder, kinds, counts, threads, amplitude):
     """Print a line for each kind and count; yields (question, kind, ratio)."""
     scene, camera, light = load(name, folder)
     scene = flat(scene)
     runners = {key: runner(scene, threads) for key, runner in RUNNERS.items()}
-    wobble = np.float32(1e-4) * np.ptp(scene.vertices, axis=0).max()
-    frames = [scene.vertices, scene.vertices + wobble]
+    frames = poses(scene.vertices, amplitude)
+    last = flat(rs.Scene([rs.Mesh(frames[-1], scene.faces, name="last")]))
     for count in counts:
         for kind in kinds:
             rays = rays_of(kind, scene, camera, light, count)
@@ -332,14 +346,21 @@ def measure(name, folder, kinds, counts, threads):
             agreement, shares = compare_hits(scene, rays, any_hit, answers)
             agreeing = ", ".join(f"{key} {share:.5f}" for key, share in shares.items())
             print(f"{name} {kind} {count}: {agreement}; equal: {agreeing}")
+            dual = runners["dual"]
+            for pose in frames:
+                moved = dual.answer(dual.frame(pose, *rays, any_hit), any_hit)
+            agreement, _ = compare_hits(last, rays, any_hit, {"dual": moved})
+            print(f"  after {_POSES} frames: {agreement}")
 
             def frame(key, step, rays=rays, any_hit=any_hit):
-                runners[key].frame(frames[step % 2], *rays, any_hit)
+                runners[key].frame(frames[step % _POSES], *rays, any_hit)
 
             def trace(key, step, prepared=prepared, any_hit=any_hit):
                 runners[key].trace(prepared[key], any_hit)
 
             for question, call in (("frame", frame), ("trace", trace)):
+                for runner in runners.values():
+                    runner.update(scene.vertices)
                 seconds = in_turn(runners, call)
                 ratio = min(seconds[key] for key in OPPONENTS) / seconds["dual"]
                 times = ", ".join(f"{key} {s * 1e3:.1f}" for key, s in seconds.items())
@@ -378,7 +399,10 @@ def main():
     parser.add_argument("--rays", default="262144,1048576")
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--builder", default=Dual.builder)
+    parser.add_argument("--amplitude", type=float, default=0.01)
     arguments = parser.parse_args()
+    Dual.builder = arguments.builder
     folder = os.environ.get("RAYSTREAM_SCENES")
     if not folder:
         sys.exit("RAYSTREAM_SCENES does not name the folder of test scenes")
@@ -395,7 +419,7 @@ def main():
     kinds, ratios = arguments.kinds.split(","), []
     print(f"10^6 rays at edges and vertices, every traversal: {missed_edges()} miss", flush=True)
     for name in arguments.scenes.split(","):
-        ratios += measure(name, folder, kinds, counts, threads[0])
+        ratios += measure(name, folder, kinds, counts, threads[0], arguments.amplitude)
     summarise(ratios)
 
 
