@@ -34,13 +34,13 @@ _COUNTS = (
 
 # Eight scenes of 24,000 to 331,000 triangles and 262,144 rays of five kinds, two cores: the better
 # builder takes some 58 ns more for each triangle, and saves some 4 ns for each visit that bundles
-# in the given order make in the fast one's tree, where they make 1.6 times as many.
+# in the given order make in the fast one's tree, where they make some twice as many.
 _VISITS_WORTH_QUALITY = 14.5  # of a triangle
 _MORE_VISITS_IN_FAST = 2
 _ASSUMED_VISITS = 7  # of a ray
 _VISITS_OF_NO_REFIT = 2  # of a triangle: some 8 ns, by which the fast builder takes longer
 _MOST_WORSE = 1.15  # a refitted tree, before another is built
-_HIGHEST_PRICE = 64
+_HIGHEST_PRICE = 64  # as many times as worth it, and versions, before another is tried
 # See `_Coherence.choice`. Measured with eight scenes, both builders, 262,144 rays from a camera,
 # from a light, off smooth and bumpy mirrors and at random, two cores: so chosen, tracing takes
 # 1.01 times what the best of bundles and streams, sorted or not, would take (geometric mean; most
@@ -114,9 +114,9 @@ class _Trees:
         self._affordable = True  # the better one, within the limit
         self._fits = False  # the better one, to the latest vertices as far as has been tried
         self._worse = None  # so many times it meets lines, where it has been refitted to them
-        # Visits of the other one since the better one was built, and times as many as would be
-        # worth it in one version: twice as many each time that it has not fitted the next. So many
-        # versions it is not tried again.
+        # Visits of the other one since the better one was built, and how many times as many as in
+        # one version they must be: twice as many each time that it has not fitted the next. For so
+        # many versions it is not tried again.
         self._visits_unpaid, self._price, self._wait = 0, 1, 0
 
     def current(self):
