@@ -296,12 +296,8 @@ inline void test_leaf_bundle(Bundle *b, ulong mask, const Tree *tree, uint node,
 {
     global const float8 *leaf = tree->leaves + (ulong)(node & ~LEAF) * LEAF_ROWS;
     Boxes boxes;
-    for (uint k = 0; k < 3; k++) {
-        const float8 v0 = leaf[k], v1 = leaf[3 + k], v2 = leaf[6 + k];
-        const float8 low = v0 < v1 ? v0 : v1, high = v0 > v1 ? v0 : v1;
-        boxes.low[k] = low < v2 ? low : v2;
-        boxes.high[k] = high > v2 ? high : v2;
-    }
+    for (uint k = 0; k < 3; k++)
+        bound_leaf(leaf, k, &boxes.low[k], &boxes.high[k]);
     float8 enter;
     uint all;
     const uint triangles

@@ -28,8 +28,7 @@ inline float8 middle(float8 thing)
 
 inline float half_area(float8 box)
 {
-    const float4 e = without_number(box.lo) + without_number(box.hi);
-    return e.x * e.y + e.y * e.z + e.z * e.x;
+    return half_area_of(without_number(box.lo) + without_number(box.hi));
 }
 
 // Lane k of a float8 in memory.
@@ -38,9 +37,9 @@ inline float half_area(float8 box)
 inline float8 thing_of(global const float4 *triangles, uint number)
 {
     global const float4 *v = triangles + TRIANGLE_FLOAT4S * (ulong)number;
-    const float4 a = v[0], b = v[1], c = v[2];
-    const float4 low = a < b ? a : b, high = a > b ? a : b;
-    float8 thing = (float8)(-(low < c ? low : c), high > c ? high : c);
+    float4 low, high;
+    bound_corners(v[0], v[1], v[2], &low, &high);
+    float8 thing = (float8)(-low, high);
     thing.FIRST = as_float(number);
     thing.WEIGHT = as_float(1);
     return thing;

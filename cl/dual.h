@@ -19,10 +19,6 @@
 #define STILL 0x1p-25f
 #define OUTWARDS (1.0f + 0x1p-20f)
 
-typedef struct {
-    float4 low, high;
-} Box;
-
 // A ray against boxes: enter and leave a plane at s = plane * inverse + near, + far.
 typedef struct {
     float inverse[3], per_t; // s = per_t * t
@@ -30,13 +26,6 @@ typedef struct {
     float far[3], end;
     uint low_row[4]; // of a node, the plane at which the ray enters
 } __attribute__((aligned(64))) BoxRay;
-
-inline Box scene_box(global const float8 *root)
-{
-    const Box b = {(float4)(lowest8(root[0]), lowest8(root[1]), lowest8(root[2]), 0.0f),
-                   (float4)(highest8(root[3]), highest8(root[4]), highest8(root[5]), 0.0f)};
-    return b;
-}
 
 inline void set_box_ray(BoxRay *r, const Box *scene, float4 org_tnear, float4 dir_tfar)
 {

@@ -104,8 +104,9 @@ kernel void gather_triangles(const uint num_triangles, const uint padded,
                      c = vertex(vertices, face[2]);
         global float4 *triangle = triangles + TRIANGLE_FLOAT4S * (ulong)i;
         triangle[0] = a, triangle[1] = b, triangle[2] = c;
-        const float4 ab_low = a < b ? a : b, ab_high = a > b ? a : b;
-        const float4 middle = (ab_low < c ? ab_low : c) + (ab_high > c ? ab_high : c);
+        float4 low, high;
+        bound_corners(a, b, c, &low, &high);
+        const float4 middle = low + high;
         lowest = middle < lowest ? middle : lowest;
         highest = middle > highest ? middle : highest;
     }

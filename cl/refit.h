@@ -23,14 +23,18 @@ inline void prefetch_triangles(global const float8 *leaf, global const float4 *t
     }
 }
 
-// The box of a leaf along an axis, low and high; lanes without a triangle are NaN.
-inline float2 extent_of_leaf(global const float8 *leaf, uint axis)
+inline Box box_of_leaf(global const float8 *leaf)
 {
-    const float8 a = leaf[axis], b = leaf[3 + axis], c = leaf[6 + axis];
-    const float8 low = a < b ? a : b, high = a > b ? a : b;
-    const float8 lowest = low < c ? low : c, highest = high > c ? high : c;
-    const int8 meant = a == a;
-    return (float2)(lowest8(meant ? lowest : (float8)INFINITY), highest8(meant ? highest : (float8)-INFINITY));
+    const int8 meant = leaf[0] == leaf[0];
+    float low[3], high[3];
+    for (uint axis = 0; axis < 3; axis++) {
+        float8 lows, highs;
+        bound_leaf(leaf, axis, &lows, &highs);
+        low[axis] = lowest8(meant ? lows : (float8)INFINITY);
+        high[axis] = highest8(meant ? highs : (float8)-INFINITY);
+    }
+    const Box b = {(float4)(low[0], low[1], low[2], 0.0f), (float4)(high[0], high[1], high[2], 0.0f)};
+    return b;
 }
 
 // Half the area of the node's children.
@@ -40,20 +44,13 @@ inline float refit_node(global float8 *nodes, global const float8 *leaves, uint 
     global const uint *children = (global const uint *)(rows + TREE_CHILD_ROW);
     float area = 0.0f;
     for (uint k = 0; k < TREE_WIDTH && children[k] != NO_CHILD; k++) {
-        float size[3];
-        for (uint axis = 0; axis < 3; axis++) {
-            float2 extent;
-            if (children[k] & LEAF) {
-                extent = extent_of_leaf(leaves + LEAF_ROWS * (ulong)(children[k] & ~LEAF), axis);
-            } else {
-                global const float8 *child = nodes + TREE_ROWS * (ulong)children[k];
-                extent = (float2)(lowest8(child[axis]), highest8(child[3 + axis]));
-            }
-            ((global float *)(rows + axis))[k] = extent.x;
-            ((global float *)(rows + 3 + axis))[k] = extent.y;
-            size[axis] = extent.y - extent.x;
-        }
-        area += size[0] * size[1] + size[1] * size[2] + size[2] * size[0];
+        const uint child = children[k];
+        const Box b = child & LEAF ? box_of_leaf(leaves + LEAF_ROWS * (ulong)(child & ~LEAF))
+                                   : box_of_node(nodes + TREE_ROWS * (ulong)child);
+        global float *lane = (global float *)rows + k;
+        lane[0] = b.low.x, lane[8] = b.low.y, lane[16] = b.low.z;
+        lane[24] = b.high.x, lane[32] = b.high.y, lane[40] = b.high.z;
+        area += half_area_of(b.high - b.low);
     }
     return area;
 }

@@ -7,8 +7,8 @@
 // choose_planes and split_ranges once a level), until they are small enough or LEVELS splits deep. The nodes
 // above are made first (plan_tasks), then the subtrees of the others side by side (build_tasks): each is
 // a task, or all the ends below a node together. A split of many things moves them from one array to the other.
-// When
-// triangles have moved a little the same tasks are refitted (refit_tasks); finish_tree says how good the tree is.
+// When triangles have moved a little the same tasks are refitted (refit_tasks); finish_tree says how good
+// the tree is.
 //
 // A range becomes a node by up to seven splits in two, each of the largest part. Sixteen bins along each axis
 // choose the place in the top levels, along one axis in tasks: the best for a sample of many things, the
@@ -256,9 +256,9 @@ kernel void plan_tasks(global const Top *restrict tops, global Tasks *restrict a
             float largest = -1.0f;
             uint chosen = INVALID;
             for (uint k = 0; k < count; k++) {
-                const float area = half_area(tops[parts[k]].box);
-                if (tops[parts[k]].state == SPLIT && (chosen == INVALID || area > largest))
-                    largest = area, chosen = k;
+                const float size = half_area(tops[parts[k]].box);
+                if (tops[parts[k]].state == SPLIT && (chosen == INVALID || size > largest))
+                    largest = size, chosen = k;
             }
             const uint front = 2 * parts[chosen];
             parts[chosen] = front;
@@ -308,7 +308,8 @@ kernel void build_tasks(global const Top *restrict tops, global const uint2 *res
     for (uint k = atomic_inc(&all->next); k < all->count; k = atomic_inc(&all->next)) {
         Task task = all->tasks[k];
         const uint h = task.range, level = 31 - clz(h), leaf = first_leaf(tops, h);
-        Subtree t = {{even, odd}, nodes, leaves, triangles, first_node(leaf) + 1, leaf, 0, 0.0f};
+        const uint first = first_node(leaf) + 1; // behind the root's
+        Subtree t = {{even, odd}, nodes, leaves, triangles, first, leaf, 0, 0.0f};
         const uint heirs = 1 << (LEVELS - level);
         t.spare = (tops[h].before + tops[h].weight) / 4 - tops[h].before / 4 + heirs;
         Range parts[TREE_WIDTH];
@@ -329,7 +330,7 @@ kernel void build_tasks(global const Top *restrict tops, global const uint2 *res
             build_subtree(&t, parts, task.count, task.node);
         task.leaf = leaf;
         task.leaf_end = t.next_leaf;
-        task.first = first_node(leaf) + 1;
+        task.first = first;
         task.first_end = t.next_node;
         task.area = t.area;
         all->tasks[k] = task;
@@ -357,11 +358,9 @@ kernel void finish_tree(const uint refit, global Tasks *restrict all, global flo
     for (uint node = all->top; refit && node-- > 0;)
         if (is_above(all, node))
             area += refit_node(nodes, leaves, node);
-    float size[3];
-    for (uint axis = 0; axis < 3; axis++)
-        size[axis] = highest8(nodes[3 + axis]) - lowest8(nodes[axis]);
+    const Box root = box_of_node(nodes);
     areas[0] = area;
-    areas[1] = size[0] * size[1] + size[1] * size[2] + size[2] * size[0];
+    areas[1] = half_area_of(root.high - root.low);
     all->next = 0;
 }
 

@@ -53,7 +53,7 @@ inline void store_counts(const Counts *c, global ulong *counts)
     const uint first = get_global_id(0) * stride * RAYS;                                           \
     const uint stop = MIN(first + RAYS, num_slots);                                                \
     const Tree tree = {nodes, leaves};                                                             \
-    const Box scene = scene_box(nodes);                                                            \
+    const Box scene = box_of_node(nodes);                                                            \
     Counts c = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
 
 // The ray in a slot, INVALID where there is none.

@@ -21,7 +21,7 @@ typedef struct {
 } Boxes;
 
 // Boxes of sixteen triangles; INFINITY and -INFINITY in lanes that are not meant.
-inline Boxes bound_corners(const float16 corners[3][3], int16 meant)
+inline Boxes bound_corners16(const float16 corners[3][3], int16 meant)
 {
     Boxes b;
     for (uint axis = 0; axis < 3; axis++) {
@@ -58,7 +58,7 @@ inline void double_middles(uint block, uint num_triangles, global const float4 *
         numbers[lane] = MIN(16 * block + lane, num_triangles - 1);
     float16 corners[3][3];
     gather_corners(triangles, numbers, corners);
-    const Boxes b = bound_corners(corners, (int16)-1);
+    const Boxes b = bound_corners16(corners, (int16)-1);
     for (uint axis = 0; axis < 3; axis++)
         middle[axis] = b.low[axis] + b.high[axis];
 }
@@ -119,7 +119,7 @@ inline void make_two_leaves(uint first, uint num_triangles, global const uint *o
     float16 corners[3][3];
     gather_corners(triangles, numbers, corners);
     const int16 meant = (int)first + LANES < (int)num_triangles;
-    const Boxes b = bound_corners(corners, meant);
+    const Boxes b = bound_corners16(corners, meant);
     const uint k = first / TREE_WIDTH % TREE_WIDTH;
     const bool second = first + TREE_WIDTH < num_triangles;
     store_two_leaves(leaves + LEAF_ROWS * (ulong)(first / TREE_WIDTH), numbers, meant, second,

@@ -15,6 +15,8 @@
 // TREE_DEPTH nodes whatever the scene (the builders prove it), hence a depth-first stack never holds more than
 // TREE_STACK entries.
 
+#include "common.h"
+
 #define TREE_WIDTH 8
 #define TREE_ROWS 8
 #define TREE_CHILD_ROW 6
@@ -24,3 +26,24 @@
 #define NO_CHILD 0xffffffffu
 #define TREE_DEPTH 24
 #define TREE_STACK ((TREE_WIDTH - 1) * TREE_DEPTH + 1)
+
+typedef struct {
+    float4 low, high;
+} Box;
+
+// The box around a node's children; those of unused lanes are empty.
+inline Box box_of_node(global const float8 *rows)
+{
+    const Box b = {(float4)(lowest8(rows[0]), lowest8(rows[1]), lowest8(rows[2]), 0.0f),
+                   (float4)(highest8(rows[3]), highest8(rows[4]), highest8(rows[5]), 0.0f)};
+    return b;
+}
+
+// The boxes of a leaf's triangles along an axis; NaN in lanes without one.
+INLINE void bound_leaf(global const float8 *leaf, uint axis, float8 *low, float8 *high)
+{
+    const float8 v0 = leaf[axis], v1 = leaf[3 + axis], v2 = leaf[6 + axis];
+    const float8 lower = v0 < v1 ? v0 : v1, higher = v0 > v1 ? v0 : v1;
+    *low = lower < v2 ? lower : v2;
+    *high = higher > v2 ? higher : v2;
+}

@@ -3,6 +3,11 @@
 #include "tree.h"
 #include "triangle.h"
 
+inline float half_area_of(float4 extent)
+{
+    return extent.x * extent.y + extent.y * extent.z + extent.z * extent.x;
+}
+
 // A node while it is made: rows of TREE_ROWS, a lane each child.
 typedef struct {
     float low[3][TREE_WIDTH], high[3][TREE_WIDTH];

@@ -28,6 +28,13 @@ DEFINE_CORNER(Corner, float)
 DEFINE_CORNER(Corner8, float8)
 DEFINE_CORNER(Corner16, float16)
 
+inline void bound_corners(float4 a, float4 b, float4 c, float4 *low, float4 *high)
+{
+    const float4 lower = a < b ? a : b, higher = a > b ? a : b;
+    *low = lower < c ? lower : c;
+    *high = higher > c ? higher : c;
+}
+
 // The components that are turned to x and y, where z is.
 #define TURNED_X(z) ((z) == 2 ? 0 : (z) + 1)
 #define TURNED_Y(z) ((z) == 0 ? 2 : (z) - 1)

@@ -77,7 +77,6 @@ class SurfaceAreaBuilder:
         self._launch(
             "build_tasks", self._workers, *splits, a["tasks"], triangles, *things, nodes, leaves
         )
-
         self._areas = self._finish(False, nodes, leaves)
 
     def refit(self, nodes, leaves):

@@ -333,7 +333,7 @@ def measure(name, folder, kinds, counts, threads, amplitude):
     scene = flat(scene)
     runners = {key: runner(scene, threads) for key, runner in RUNNERS.items()}
     frames = poses(scene.vertices, amplitude)
-    last = flat(rs.Scene([rs.Mesh(frames[-1], scene.faces, name="last")]))
+    last = rs.Scene([rs.Mesh(frames[-1], scene.faces, name="last")])
     for count in counts:
         for kind in kinds:
             rays = rays_of(kind, scene, camera, light, count)
