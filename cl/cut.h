@@ -92,6 +92,54 @@ typedef ulong Amount;
 #define THINGS(amount) ((uint)((amount) >> 32))
 #define TRIANGLES(amount) ((uint)(amount))
 
+// Things between cells along an axis.
+typedef struct {
+    float8 boxes[BINS];
+    Amount amounts[BINS];
+} Bins;
+
+inline void clear_bins(Bins *bins, uint count)
+{
+    for (uint i = 0; i < count; i++)
+        for (uint k = 0; k < BINS; k++)
+            bins[i].boxes[k] = -INFINITY, bins[i].amounts[k] = 0;
+}
+
+INLINE void add_thing(Bins *bins, uint bin, float8 thing)
+{
+    bins->boxes[bin] = larger8(bins->boxes[bin], thing);
+    bins->amounts[bin] += THING(weight_of(thing));
+}
+
+inline void join_bins(Bins *bins, const Bins *more)
+{
+    for (uint k = 0; k < BINS; k++) {
+        bins->boxes[k] = larger8(bins->boxes[k], more->boxes[k]);
+        bins->amounts[k] += more->amounts[k];
+    }
+}
+
+// Every `step`-th thing, along each axis. Two tables of three: equal bins in a row would wait for each other.
+inline void bin_things(Bins *tables, Binning b, global const float8 *things, uint begin, uint end,
+                       uint step)
+{
+    for (uint i = begin; i < end; i += step) {
+        const float8 thing = things[i];
+        const float4 place = (doubled_middle(thing) - b.low) * b.scale;
+        Bins *table = tables + 3 * (i / step & 1);
+        add_thing(table, bin_at(place.x), thing);
+        add_thing(table + 1, bin_at(place.y), thing);
+        add_thing(table + 2, bin_at(place.z), thing);
+    }
+}
+
+// The second table into the first.
+inline void join_tables(Bins *tables)
+{
+    for (uint axis = 0; axis < 3; axis++)
+        join_bins(tables + axis, tables + 3 + axis);
+}
+
 // A cut of sixteen boxes in a row behind number `last`; so much before it.
 typedef struct {
     float cost;
@@ -135,15 +183,15 @@ INLINE float16 half_areas(const float16 *rows)
 
 // The cheapest cut of boxes along an axis, if it is cheaper than `best`. Among equals the middle one: of
 // boxes without an area each would leave but one thing before it.
-inline void improve_cut(Cut *best, uint axis, const float8 *boxes, const Amount *amounts)
+inline void improve_cut(Cut *best, uint axis, const Bins *bins)
 {
     float4 s[2][BINS] __attribute__((aligned(64)));
     Amount sums[BINS], all = 0;
     uint weights[BINS] __attribute__((aligned(64)));
     for (uint k = 0; k < BINS; k++) {
-        s[0][k] = boxes[k].lo;
-        s[1][k] = boxes[k].hi;
-        sums[k] = all += amounts[k];
+        s[0][k] = bins->boxes[k].lo;
+        s[1][k] = bins->boxes[k].hi;
+        sums[k] = all += bins->amounts[k];
         weights[k] = TRIANGLES(all);
     }
     float16 rows[6], before[6], behind[6], unused;
@@ -174,14 +222,14 @@ typedef struct {
     float8 boxes[2], middles[2];
 } Parts;
 
-inline Parts cut_parts(const Cut *cut, Line line, const float8 *boxes, float8 middles)
+inline Parts cut_parts(const Cut *cut, Line line, const Bins *bins, float8 middles)
 {
     Parts p;
     float8 before = -INFINITY, behind = -INFINITY;
     for (uint k = 0; k < BINS; k++) {
         const int8 front = k <= cut->last ? -1 : 0;
-        before = larger8(before, front ? boxes[k] : (float8)-INFINITY);
-        behind = larger8(behind, front ? (float8)-INFINITY : boxes[k]);
+        before = larger8(before, front ? bins->boxes[k] : (float8)-INFINITY);
+        behind = larger8(behind, front ? (float8)-INFINITY : bins->boxes[k]);
     }
     p.boxes[0] = before;
     p.boxes[1] = behind;
@@ -192,48 +240,4 @@ inline Parts cut_parts(const Cut *cut, Line line, const float8 *boxes, float8 mi
     *high = MIN(*high, plane);
     *low = MIN(*low, -plane);
     return p;
-}
-
-// ---- bins along all axes ----
-
-typedef struct {
-    float8 boxes[3][BINS];
-    Amount amounts[3][BINS];
-} Bins;
-
-// Two tables: equal bins in a row would wait for each other.
-inline void clear_bins(Bins *tables)
-{
-    for (uint axis = 0; axis < 3; axis++)
-        for (uint k = 0; k < BINS; k++) {
-            tables[0].boxes[axis][k] = tables[1].boxes[axis][k] = -INFINITY;
-            tables[0].amounts[axis][k] = tables[1].amounts[axis][k] = 0;
-        }
-}
-
-// Every `step`-th thing.
-inline void bin_things(Bins *tables, Binning b, global const float8 *things, uint begin, uint end,
-                       uint step)
-{
-    for (uint i = begin; i < end; i += step) {
-        const float8 thing = things[i];
-        const float4 place = (doubled_middle(thing) - b.low) * b.scale;
-        const uint bin[3] = {bin_at(place.x), bin_at(place.y), bin_at(place.z)};
-        Bins *table = tables + (i / step & 1);
-#pragma unroll
-        for (uint axis = 0; axis < 3; axis++) {
-            table->boxes[axis][bin[axis]] = larger8(table->boxes[axis][bin[axis]], thing);
-            table->amounts[axis][bin[axis]] += THING(weight_of(thing));
-        }
-    }
-}
-
-// The second into the first.
-inline void join_tables(Bins *tables)
-{
-    for (uint axis = 0; axis < 3; axis++)
-        for (uint k = 0; k < BINS; k++) {
-            tables[0].boxes[axis][k] = larger8(tables[0].boxes[axis][k], tables[1].boxes[axis][k]);
-            tables[0].amounts[axis][k] += tables[1].amounts[axis][k];
-        }
 }

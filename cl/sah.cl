@@ -76,6 +76,13 @@ inline uint gather_things(global const float4 *triangles, uint begin, uint end, 
     return at + 1;
 }
 
+// Bins are kept by range, piece and axis.
+inline void store_bins(const Bins *table, global Bins *bins)
+{
+    for (uint axis = 0; axis < 3; axis++)
+        bins[axis] = table[axis];
+}
+
 // The things, in PIECES, and the bins of range 1.
 kernel void start_build(const uint num_triangles, const uint target,
                         global const float4 *restrict triangles, const uint num_boxes,
@@ -89,8 +96,8 @@ kernel void start_build(const uint num_triangles, const uint target,
     join_boxes(middles, num_boxes, &low, &high);
     const float8 around = (float8)(-low, high);
     const Binning b = binning_of(around);
-    Bins tables[2];
-    clear_bins(tables);
+    Bins tables[6];
+    clear_bins(tables, 6);
     uint at = begin;
     for (uint i = begin; i < end; i += BLOCK) {
         const uint first = at;
@@ -98,7 +105,7 @@ kernel void start_build(const uint num_triangles, const uint target,
         bin_things(tables, b, things, first, at, 1);
     }
     join_tables(tables);
-    bins[k] = tables[0];
+    store_bins(tables, bins + 3 * k);
     pieces[PIECES + k] = (uint2)(begin, at);
     if (k > 0)
         return;
@@ -116,26 +123,23 @@ kernel void choose_planes(const uint level, const uint target, global Top *restr
     tops[2 * h].state = tops[2 * h + 1].state = NONE;
     if (whole.state != OPEN)
         return;
-    bins += (ulong)PIECES * get_global_id(0);
-    float8 boxes[3][BINS];
-    Amount amounts[BINS];
+    bins += 3 * (ulong)PIECES * get_global_id(0);
+    Bins all[3];
+    clear_bins(all, 3);
     Cut cut = {INFINITY, 0, 0, 0};
     for (uint axis = 0; axis < 3; axis++) {
-        for (uint k = 0; k < BINS; k++) {
-            boxes[axis][k] = -INFINITY, amounts[k] = 0;
-            for (uint piece = 0; piece < PIECES; piece++) {
-                boxes[axis][k] = larger8(boxes[axis][k], bins[piece].boxes[axis][k]);
-                amounts[k] += bins[piece].amounts[axis][k];
-            }
+        for (uint piece = 0; piece < PIECES; piece++) {
+            const Bins some = bins[3 * piece + axis];
+            join_bins(all + axis, &some);
         }
-        improve_cut(&cut, axis, boxes[axis], amounts);
+        improve_cut(&cut, axis, all + axis);
     }
     if (!(cut.cost < INFINITY)) {
         tops[h].state = END;
         return;
     }
     const Line line = line_of(whole.middles, cut.axis);
-    const Parts parts = cut_parts(&cut, line, boxes[cut.axis], whole.middles);
+    const Parts parts = cut_parts(&cut, line, all + cut.axis, whole.middles);
     const uint weight = TRIANGLES(cut.before), rest = whole.weight - weight;
     const uint at = whole.begin + THINGS(cut.before);
     const Top front = {parts.boxes[0], parts.middles[0], whole.begin, whole.before, weight,
@@ -154,7 +158,7 @@ kernel void choose_planes(const uint level, const uint target, global Top *restr
         of_front[piece].x = next;
         of_back[piece].x = behind;
         for (uint k = 0; k < BINS; k++) {
-            const uint count = THINGS(bins[piece].amounts[cut.axis][k]);
+            const uint count = THINGS(bins[3 * piece + cut.axis].amounts[k]);
             next += k <= cut.last ? count : 0;
             behind += k <= cut.last ? 0 : count;
         }
@@ -178,9 +182,9 @@ kernel void split_ranges(const uint level, global const Top *restrict tops,
     const float plane = whole.last + 1;
     const bool open[2] = {tops[2 * h].state == OPEN, tops[2 * h + 1].state == OPEN};
     const Binning inner[2] = {binning_of(tops[2 * h].middles), binning_of(tops[2 * h + 1].middles)};
-    Bins tables[2][2];
-    clear_bins(tables[0]);
-    clear_bins(tables[1]);
+    Bins tables[2][6];
+    clear_bins(tables[0], 6);
+    clear_bins(tables[1], 6);
     const uint2 mine = pieces[h * PIECES + piece];
     uint front = pieces[2 * h * PIECES + piece].x, back = pieces[(2 * h + 1) * PIECES + piece].x;
     for (uint i = mine.x; i < mine.y; i += BLOCK) {
@@ -196,12 +200,12 @@ kernel void split_ranges(const uint level, global const Top *restrict tops,
         if (open[1])
             bin_things(tables[1], inner[1], to, first_back, back, 1);
     }
-    bins += 2 * range * PIECES + piece;
+    bins += 3 * (2 * range * PIECES + piece);
     for (uint side = 0; side < 2; side++) {
         if (!open[side])
             continue;
         join_tables(tables[side]);
-        bins[side * PIECES] = tables[side][0];
+        store_bins(tables[side], bins + 3 * side * PIECES);
     }
 }
 

@@ -2,7 +2,7 @@
 
 #include "cut.h"
 
-#define FEW 16 // things that are sorted
+#define FEW BINS // things that are sorted
 #define MANY 256 // things of which SAMPLE choose the axis
 #define SAMPLE 64
 #define TASK_LEVELS 14
@@ -68,12 +68,12 @@ inline uint choose_axis(const Subtree *t, const Range *r)
     Cut cut = {INFINITY, longest(r->middles), 0, 0};
     if (count < MANY)
         return cut.axis;
-    Bins tables[2];
-    clear_bins(tables);
+    Bins tables[6];
+    clear_bins(tables, 6);
     bin_things(tables, binning_of(r->middles), t->things[r->swapped], r->begin, r->end, count / SAMPLE);
     join_tables(tables);
     for (uint axis = 0; axis < 3; axis++)
-        improve_cut(&cut, axis, tables[0].boxes[axis], tables[0].amounts[axis]);
+        improve_cut(&cut, axis, tables + axis);
     return cut.axis;
 }
 
@@ -81,26 +81,15 @@ inline uint choose_axis(const Subtree *t, const Range *r)
 inline Cut cut_many(const Subtree *t, const Range *r, Line line, Parts *parts)
 {
     global const float8 *things = t->things[r->swapped];
-    // Two tables: equal bins in a row would wait for each other.
-    float8 boxes[2][BINS];
-    Amount amounts[2][BINS];
-    for (uint k = 0; k < BINS; k++) {
-        boxes[0][k] = boxes[1][k] = -INFINITY;
-        amounts[0][k] = amounts[1][k] = 0;
-    }
-    for (uint i = r->begin, end = r->end; i < end; i++) {
-        const uint bin = bin_at(place_along(line, things, i));
-        boxes[i & 1][bin] = larger8(boxes[i & 1][bin], things[i]);
-        amounts[i & 1][bin] += THING(weight_of(things[i]));
-    }
-    for (uint k = 0; k < BINS; k++) {
-        boxes[0][k] = larger8(boxes[0][k], boxes[1][k]);
-        amounts[0][k] += amounts[1][k];
-    }
+    Bins tables[2]; // as those of bin_things
+    clear_bins(tables, 2);
+    for (uint i = r->begin, end = r->end; i < end; i++)
+        add_thing(tables + (i & 1), bin_at(place_along(line, things, i)), things[i]);
+    join_bins(tables, tables + 1);
     Cut cut = {INFINITY, 0, 0, 0};
-    improve_cut(&cut, line.axis, boxes[0], amounts[0]);
+    improve_cut(&cut, line.axis, tables);
     if (cut.cost < INFINITY)
-        *parts = cut_parts(&cut, line, boxes[0], r->middles);
+        *parts = cut_parts(&cut, line, tables, r->middles);
     return cut;
 }
 
@@ -127,24 +116,22 @@ inline Cut cut_few(const Subtree *t, const Range *r)
     global float8 *things = t->things[r->swapped] + r->begin;
     const uint count = r->end - r->begin;
     const float8 box = r->box;
-    float8 few[FEW], sorted[FEW];
-    Amount amounts[FEW];
+    float8 few[FEW];
+    Bins sorted; // one thing each
     uint ranks[3][FEW] __attribute__((aligned(64)));
-    for (uint i = 0; i < FEW; i++) {
+    for (uint i = 0; i < FEW; i++)
         few[i] = i < count ? things[i] : (float8)-INFINITY;
-        sorted[i] = -INFINITY;
-        amounts[i] = 0;
-    }
+    clear_bins(&sorted, 1);
     Cut cut = {INFINITY, 0, 0, 0};
     for (uint axis = 0; axis < 3; axis++) {
         rank_few(few, count, AT(box, axis), axis, ranks[axis]);
         for (uint i = 0; i < count; i++) {
             const uint place = ranks[axis][i];
-            sorted[place] = few[i];
-            amounts[place] = THING(weight_of(few[i]));
+            sorted.boxes[place] = few[i];
+            sorted.amounts[place] = THING(weight_of(few[i]));
             PREFETCH(t->triangles + TRIANGLE_FLOAT4S * (ulong)as_uint(few[i].FIRST) + axis);
         }
-        improve_cut(&cut, axis, sorted, amounts);
+        improve_cut(&cut, axis, &sorted);
     }
     for (uint i = 0; i < count; i++)
         things[ranks[cut.axis][i]] = few[i];
